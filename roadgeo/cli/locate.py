@@ -101,7 +101,7 @@ a photograph is kept as PHOTO_mask.tif. What Ctrl-C cut short goes on with --ski
 def _listed(outputs: Sequence[Output]) -> str:
     """List files with their purposes."""
     names = [output.path(Path(), "photo").name for output in outputs]
-    said = [f"{one.option}: {one.summary}" if one.option else one.summary for one in outputs]
+    said = [f"{output.option}: {output.summary}" if output.option else output.summary for output in outputs]
     width = max(map(len, names))
     return "\n".join(f"  {name:<{width}}  {text}" for name, text in zip(names, said, strict=True))
 
@@ -165,7 +165,9 @@ _OPTIONS = (
     "locate",
     cls=Command,
     short_help="Find where images lie on a map, and draw them there.",
-    help=_HELP.format(always=_listed([one for one in ALWAYS if one.ending.endswith((".json", ".tif", ".gpkg"))])),
+    help=_HELP.format(
+        always=_listed([output for output in ALWAYS if output.ending.endswith((".json", ".tif", ".gpkg"))])
+    ),
     more=_more,
 )
 @click.argument("masks", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
@@ -221,8 +223,8 @@ def locate_command(
     refuse_swapped(given["near"], opened)
     compile_once(quiet)
     outcomes: list[Outcome] = []
-    one = len(tasks) == 1
-    with show_steps(quiet or not one) as say, count_up(len(tasks), quiet, as_json, _summarize) as count:
+    is_single = len(tasks) == 1
+    with show_steps(quiet or not is_single) as say, count_up(len(tasks), quiet, as_json, _summarize) as count:
         for outcome in locate_masks(
             tasks,
             references,
@@ -234,7 +236,7 @@ def locate_command(
         ):
             outcomes.append(outcome)
             count(outcome.status)
-            _report(outcome, as_json, quiet, verbose, single=one)
+            _report(outcome, as_json, quiet, verbose, single=is_single)
     if not quiet:
         tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
     counts = Counter[str](outcome.status for outcome in outcomes)
@@ -267,8 +269,8 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
 def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
     """Match photographs with masks.
 
-    One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask". Of
-    several with that name the first format of `SUFFIXES` counts.
+    One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask".
+    Where several have that name the first format of `SUFFIXES` counts.
 
     Raises
     ------

@@ -164,7 +164,7 @@ def track_command(
         follow = _place_all if unordered else _follow
         for frame, news in follow(frames, reading, opened, options):
             pictures.add(frame.number, frame.mask)
-            known.update({one.frame.number: _without_mask(one) for one in news})
+            known.update({state.frame.number: _without_mask(state) for state in news})
             fresh = make_rows(news, start, focal_px)
             send(fresh[-1])
             for row in fresh:
@@ -177,8 +177,8 @@ def track_command(
     counts = Counter(row.status for row in rows)
     if not quiet:
         tell_accuracy(row.to_dict() for row in rows)
-        told = ", ".join(f"{n} {status}" for status, n in counts.items())
-        echo(f"{len(rows)} frames: {told}; wrote {', '.join(files)}", err=True)
+        summary = ", ".join(f"{n} {status}" for status, n in counts.items())
+        echo(f"{len(rows)} frames: {summary}; wrote {', '.join(files)}", err=True)
     return NOT_LOCATED if counts["lost"] else 0
 
 
@@ -197,13 +197,13 @@ def _place_all(
     from roadgeo.flights.frames import read_stills
     from roadgeo.flights.strips import place_strips
 
-    for one in place_strips(list(read_stills(frames, reading)), opened, options):
-        yield one.frame, [one]
+    for tracked in place_strips(list(read_stills(frames, reading)), opened, options):
+        yield tracked.frame, [tracked]
 
 
 @contextmanager
 def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
-    """Yield a function that sends the place of the latest frame; its time is that of reading, unless it has one."""
+    """Yield a function that sends the place of the latest frame; its time is when it was read, unless it has a time."""
     if url is None:
         yield lambda _: None
         return
@@ -244,7 +244,7 @@ def _frame_options(given: dict[str, Any]) -> FrameOptions:
     )
 
 
-def _without_mask(one: Tracked) -> Tracked:
+def _without_mask(tracked: Tracked) -> Tracked:
     """Forget the pixels of a frame: a long flight has many."""
     from dataclasses import replace
 
@@ -252,8 +252,8 @@ def _without_mask(one: Tracked) -> Tracked:
 
     from roadgeo.geometry.mask import RoadMask
 
-    bare = RoadMask(np.zeros((1, 1), np.bool_), name=one.frame.name)
-    return replace(one, frame=replace(one.frame, mask=bare))
+    bare = RoadMask(np.zeros((1, 1), np.bool_), name=tracked.frame.name)
+    return replace(tracked, frame=replace(tracked.frame, mask=bare))
 
 
 def _write(folder: Path, name: str, tracked: list[Tracked], rows: list[Row], pictures: Any) -> list[str]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["describe", "verify_command"]
 
-#: Exit statuses besides those of all commands.
+#: Exit status of this command alone.
 OFF = 4
 
 _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
@@ -71,7 +71,7 @@ def verify_command(
     """Check whether georeferenced IMAGEs are where they claim to be, by the roads they show.
 
     An image is a road mask or a photograph with a place: a geotransform, control
-    points, or a world file. Its roads are held against those of a reference, from the given place outwards; the world
+    points, or a world file. Its roads are held against a reference's, from the given place outwards; the world
     is never searched (`roadgeo locate` does that). Each image
 
     \b
@@ -109,15 +109,15 @@ def verify_command(
         make_folder(out_dir)
     results: list[Verified] = []
     with count_up(len(tasks), quiet, as_json) as count:
-        for task, one in zip(tasks, verify_images(tasks, settings, jobs), strict=True):
-            results.append(one)
-            count(one.verdict)
+        for task, verified in zip(tasks, verify_images(tasks, settings, jobs), strict=True):
+            results.append(verified)
+            count(verified.verdict)
             stem = Path(out_dir) / task.stem
-            pages = [_write_page(one, task.mask, stem, opened, settings)] if given["report"] else []
-            files = [*pages, *_correct(one, Path(task.mask), stem, fix, in_place)]
-            _report(one, files, as_json, quiet, verbose)
-    documents = [one.document for one in results]
-    counts = Counter(one.verdict for one in results)
+            pages = [_write_page(verified, task.mask, stem, opened, settings)] if given["report"] else []
+            files = [*pages, *_correct(verified, Path(task.mask), stem, fix, in_place)]
+            _report(verified, files, as_json, quiet, verbose)
+    documents = [verified.document for verified in results]
+    counts = Counter(verified.verdict for verified in results)
     if len(tasks) > 1:
         write_table(Path(out_dir) / "roadgeo_verify.csv", documents)
         if not quiet:
@@ -137,34 +137,36 @@ def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
     return VerifyRun(given["references"], options, read_options(given, others, jobs), given["crs"])
 
 
-def _write_page(one: Verified, image: str, stem: Path, opened: Sequence[AnyReference], settings: VerifyRun) -> Path:
+def _write_page(
+    verified: Verified, image: str, stem: Path, opened: Sequence[AnyReference], settings: VerifyRun
+) -> Path:
     """Write the report of an image."""
     from roadgeo.outputs.report.verification import write_verification
     from roadgeo.sources.georeference import read_georeference
 
     page = stem.with_name(f"{stem.name}_verify.html")
-    place = None if one.verdict == "error" else read_georeference(image, settings.crs)
+    place = None if verified.verdict == "error" else read_georeference(image, settings.crs)
     indexes = [] if place is None else [index for each in opened for index in each.indexes_at([place.middle()])]
-    index = next((index for index in indexes if index.name == one.document.get("reference")), None)
-    said = click.unstyle(describe(one.document)).removeprefix(f"{image}: {one.verdict}: ")
-    write_verification(page, one.document, said, place, one.corrected, index)
+    index = next((index for index in indexes if index.name == verified.document.get("reference")), None)
+    said = click.unstyle(describe(verified.document)).removeprefix(f"{image}: {verified.verdict}: ")
+    write_verification(page, verified.document, said, place, verified.corrected, index)
     return page
 
 
-def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) -> list[Path]:
+def _correct(verified: Verified, image: Path, stem: Path, fix: bool, in_place: bool) -> list[Path]:
     """Write the corrected files of an image that is off, as far as they are asked for."""
     from roadgeo.outputs.verification_files import write_fixed, write_in_place, write_points
     from roadgeo.storage.orientation import read_orientation
 
-    if one.corrected is None:
+    if verified.corrected is None:
         return []
     files = []
     if fix:
         files = [stem.with_name(f"{stem.name}_fixed{ending}") for ending in (".tif", ".points")]
-        write_fixed(image, files[0], one.corrected)
-        write_points(files[1], one.corrected.of_stored(read_orientation(image)))
+        write_fixed(image, files[0], verified.corrected)
+        write_points(files[1], verified.corrected.of_stored(read_orientation(image)))
     if in_place:
-        write_in_place(image, one.corrected)
+        write_in_place(image, verified.corrected)
         files.append(image)
     return files
 
@@ -182,14 +184,14 @@ def describe(document: dict[str, Any]) -> str:
     return f"{document['image']}: {word}: {document['reason']}"
 
 
-def _report(one: Verified, files: list[Path], as_json: bool, quiet: bool, verbose: bool) -> None:
+def _report(verified: Verified, files: list[Path], as_json: bool, quiet: bool, verbose: bool) -> None:
     if as_json:
-        echo(json.dumps({**one.document, **made_by()}))
-    if one.verdict == "error":
-        echo(f"{click.style('Error:', fg='red')} {' '.join(one.document['reason'].split())}", err=True)
+        echo(json.dumps({**verified.document, **made_by()}))
+    if verified.verdict == "error":
+        echo(f"{click.style('Error:', fg='red')} {' '.join(verified.document['reason'].split())}", err=True)
     elif not quiet:
-        echo(describe(one.document), err=as_json)
-        if verbose and one.document.get("log10_lead") is not None:
-            echo(f"  leads any other place nearby by 10^{one.document['log10_lead']:.1f}", err=as_json)
+        echo(describe(verified.document), err=as_json)
+        if verbose and verified.document.get("log10_lead") is not None:
+            echo(f"  leads any other place nearby by 10^{verified.document['log10_lead']:.1f}", err=as_json)
         if files:
             echo(f"  wrote {', '.join(map(str, files))}", err=as_json)

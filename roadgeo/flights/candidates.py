@@ -47,7 +47,7 @@ class CandidateOptions:
     per_look : int
         Best places of each look that are weighed again with the frames to come.
     most : int
-        Of more, those that explain most are kept.
+        The places that explain most are kept, up to this number.
     """
 
     per_look: int = 30
@@ -134,8 +134,8 @@ class Candidates:
 
     def look(self, look: Look, options: LocateOptions) -> Location:
         """Weigh what was proposed, search the map where that is due, and judge both together."""
-        for one in self._kept:
-            one.lay(look, options)
+        for place in self._kept:
+            place.lay(look, options)
         self.n_looks += look.searched
         if look.searched and options.effort == "full":
             # A quick search proposes the place nearly as often, in a tenth of the time: it will do where that leads.
@@ -148,11 +148,11 @@ class Candidates:
         """Search the map where that is due, and judge the results together with earlier proposals."""
         found: list[Found] = []
         if look.searched:
-            parts = [part for one in self.references for part in one.parts]
+            parts = [part for reference in self.references for part in reference.parts]
             found = search_references(look.query, parts, options, options.search.time_limit_s, explained=True)
-        for one in found:
-            self._take(one, look, options)
-        self._kept = [one for one in self._kept if one.fit is not None]
+        for result in found:
+            self._take(result, look, options)
+        self._kept = [place for place in self._kept if place.fit is not None]
         self._kept = sorted(self._kept, key=_likelihood, reverse=True)[: self.options.most]
         return decide(look.query, self._judged(found, look, options), options)
 
@@ -161,24 +161,24 @@ class Candidates:
 
         Return the results, with that place and its best rival alone. Each look may find a place by chance.
         """
-        judged = [replace(one, fits=()) for one in found]
+        judged = [replace(result, fits=()) for result in found]
         best = self._best(look)
         if best is None or best.fit is None:
-            return judged or [Found(one.index) for one in self.references]
+            return judged or [Found(reference.index) for reference in self.references]
         scene, size, fit = look.query.scene, look.query.scene.size, best.fit
         evidence = Evidence(scene, best.index, sampling(fit.matrix, size))
         worth, paid = evidence.weigh(fit.matrix), math.log10(max(self.n_looks, 1))
-        others = [one.fit for one in self._kept if one.fit is not None and one is not best]
-        rivals = [(self._weigh(look, one, evidence.gsd_m), one) for one in others if _differ(one, fit, size)]
-        rival = max(rivals, key=lambda one: one[0], default=None)
+        others = [place.fit for place in self._kept if place.fit is not None and place is not best]
+        rivals = [(self._weigh(look, other, evidence.gsd_m), other) for other in others if _differ(other, fit, size)]
+        rival = max(rivals, key=lambda pair: pair[0], default=None)
         most = max(evidence.nearby(fit.matrix), 0.0 if rival is None else rival[0])
         if worth - most - paid >= options.min_log10_odds:
             compare = evidence.compared_with(fit.matrix)
             around = similar_places(fit.matrix, evidence, compare, options.match)[:N_LAID]
-            most = max([most, *(one.worth for one in around if not _are_one(one.matrix, fit.matrix, size))])
+            most = max([most, *(other.worth for other in around if not _are_one(other.matrix, fit.matrix, size))])
         lead = worth - max(most, 0.0) - paid
         fits = (replace(fit, log10_odds=lead),) + (() if rival is None else (replace(rival[1], log10_odds=-lead),))
-        k = next((k for k, one in enumerate(judged) if one.index is best.whole), len(judged))
+        k = next((k for k, result in enumerate(judged) if result.index is best.whole), len(judged))
         if k == len(judged):
             judged.append(Found(best.whole, n_searched=len(best.whole)))
         judged[k] = replace(judged[k], fits=fits)
@@ -191,8 +191,8 @@ class Candidates:
             if best is None or best.fit is None:
                 return None
             gsd = sampling(best.fit.matrix, look.query.scene.size)
-            weighed = [(self._weigh(look, one.fit, gsd), one) for one in self._kept if one.fit is not None]
-            before, best = best, max(weighed, key=lambda one: one[0])[1]
+            weighed = [(self._weigh(look, place.fit, gsd), place) for place in self._kept if place.fit is not None]
+            before, best = best, max(weighed, key=lambda pair: pair[0])[1]
             if best is before:
                 break
         return best
@@ -207,31 +207,31 @@ class Candidates:
         if estimator is None:
             return
         best: list[Hypothesis] = []
-        for model in sorted(estimator.verified, key=lambda one: -one.log10_likelihood):
-            if len(best) < self.options.per_look and not any(estimator.same(model, one) for one in best):
+        for model in sorted(estimator.verified, key=lambda model: -model.log10_likelihood):
+            if len(best) < self.options.per_look and not any(estimator.same(model, known) for known in best):
                 best.append(model)
         for model in best:
-            here = (one for one in self._kept if one.whole is found.index)
-            if not any(_are_one(_lay(one, look), model.matrix, size) for one in here):
+            here = (place for place in self._kept if place.whole is found.index)
+            if not any(_are_one(_lay(place, look), model.matrix, size) for place in here):
                 new = _Candidate(estimator.index, found.index, model.matrix @ to_frame, last)
                 new.lay(look, options)
                 self._kept.append(new)
 
 
-def _likelihood(one: _Candidate) -> float:
-    return -math.inf if one.fit is None else one.fit.log10_likelihood
+def _likelihood(place: _Candidate) -> float:
+    return -math.inf if place.fit is None else place.fit.log10_likelihood
 
 
-def _differ(one: Fit, other: Fit, size: tuple[int, int]) -> bool:
-    return one.index is not other.index or not _are_one(one.matrix, other.matrix, size)
+def _differ(fit: Fit, other: Fit, size: tuple[int, int]) -> bool:
+    return fit.index is not other.index or not _are_one(fit.matrix, other.matrix, size)
 
 
-def _lay(one: _Candidate, look: Look) -> FloatArray | None:
+def _lay(place: _Candidate, look: Look) -> FloatArray | None:
     """Return where a place puts the mosaic, query plane to reference plane; None where their frames do not touch."""
-    if one.seen_at not in look.numbers:
+    if place.seen_at not in look.numbers:
         return None
-    to_mosaic = look.mosaic.to_mosaic[list(look.numbers).index(one.seen_at)]
-    matrix = one.matrix @ np.linalg.inv(to_mosaic) @ PIXEL_TO_PLANE
+    to_mosaic = look.mosaic.to_mosaic[list(look.numbers).index(place.seen_at)]
+    matrix = place.matrix @ np.linalg.inv(to_mosaic) @ PIXEL_TO_PLANE
     return np.asarray(matrix / matrix[2, 2])
 
 

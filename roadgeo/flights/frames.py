@@ -50,7 +50,7 @@ class FrameOptions:
     motion_px : float or None
         Standard deviation of a corner moved by the motion. None: the usual one of its source.
     every_s : float
-        Of a video, the time between the frames taken; 0: all.
+        Time between the frames taken of a video; 0: all.
     interval_s : float
         Time between images without timestamps.
     recursive : bool
@@ -197,7 +197,7 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
 
 
 def _blank(image: _Image) -> RoadMask | None:
-    """Return a mask without any road for a frame of one colour, which a flight may hold; None if it is none."""
+    """Return a mask without any road for a frame of one colour, which a flight may hold; None for any other."""
     from roadgeo.storage.rasters import open_raster
 
     with suppress(MaskError), open_raster(image.path) as raster:

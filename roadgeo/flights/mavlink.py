@@ -37,7 +37,7 @@ class MavlinkOptions:
     Attributes
     ----------
     system, target_system, target_component : int
-        Ours, as that of the vehicle we are on, and the autopilot's.
+        Our system, which is the vehicle's, and the autopilot.
     max_rate_hz : float
         Places that come faster are left out.
     heartbeat_hz : float
@@ -75,16 +75,16 @@ class PositionFix:
 def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
     """Return our position, from a frame's row or a location as plain values; None where that is not known.
 
-    That is the place of the camera where its focal length was given, and otherwise that of the frame's middle. A frame
-    whose roads contradict the place that its motion predicts is not known.
+    It is the place of the camera where its focal length was given, and otherwise the frame's middle. The place of a
+    frame whose roads contradict its motion is not known.
     """
     if found.get("status") == "predicted" and found.get("log10_odds") is not None:
         return None
     camera = found.get("camera")
     if camera and camera.get("source", "camera") == "camera":
-        told = camera.get("sigma")
+        stated = camera.get("sigma")
         known = found.get("lonlat_accuracy_m") or 0.0
-        sigma = camera["sigma_m"] if told is None else math.hypot(told["x_m"], told["y_m"], known)
+        sigma = camera["sigma_m"] if stated is None else math.hypot(stated["x_m"], stated["y_m"], known)
         return PositionFix(camera["lon"], camera["lat"], sigma, taken_s)
     if found.get("center") is None or found.get("status") == "ambiguous":
         return None

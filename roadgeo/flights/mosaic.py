@@ -102,7 +102,7 @@ def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = Non
 def lay_together(
     masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float, options: MosaicOptions | None = None
 ) -> Mosaic | None:
-    """Lay frames of one size on one plane; None where the motion cannot be that of a camera above a plane.
+    """Lay frames of one size on one plane; None where no camera above a plane moves so.
 
     Parameters
     ----------

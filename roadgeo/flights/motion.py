@@ -47,7 +47,7 @@ _LEAST_SHARED = 0.3
 #: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before,
 #: and the score of a motion that differs is reduced by this much, per frame's side.
 _STEADY, _OTHERWISE = 0.1, 1.28
-#: How well a motion must fit (see `_Laid`), where that of the frame before is known, and where it is not; by how much
+#: How well a motion must fit (see `_Laid`), where the frame's before is known, and where it is not; by how much
 #: it must then lead any other.
 _LEAST_AGAIN, _LEAST_FIRST, _LEAD_FIRST = 0.3, 0.55, 0.06
 #: How far off a corner may be put by masks, and by taking the flight to go on as it went; and how often in a row it is.
@@ -106,8 +106,8 @@ def between_images(before: AnyArray, image: AnyArray) -> FloatArray | None:
     scale = min(1.0, _IMAGE_SIDE / max(*image.shape, *before.shape))
     finder = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined]
     found = [
-        finder.detectAndCompute(cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), None)
-        for one in (before, image)
+        finder.detectAndCompute(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), None)
+        for grey in (before, image)
     ]
     if any(descriptors is None or len(points) < _FEWEST_FEATURES for points, descriptors in found):
         return None
@@ -180,8 +180,8 @@ class _Laid(NamedTuple):
         return agrees or self.fit > other.fit - _LEAD_FIRST
 
 
-def between_masks(one: TracedMask, other: TracedMask, last: FloatArray | None = None) -> FloatArray | None:
-    """Return the motion (3, 3) of `other` against `one` by the roads that both show; None where those do not fix it.
+def between_masks(first: TracedMask, other: TracedMask, last: FloatArray | None = None) -> FloatArray | None:
+    """Return the motion (3, 3) of `other` against `first` by the roads that both show; None where those do not fix it.
 
     Parameters
     ----------
@@ -190,38 +190,40 @@ def between_masks(one: TracedMask, other: TracedMask, last: FloatArray | None = 
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    guesses = _rough_motions(one.mask, other.mask, 2 * len(_TURNS_DEG))
+    guesses = _rough_motions(first.mask, other.mask, 2 * len(_TURNS_DEG))
     if last is not None:
         guesses = [last, *(guess for guess in guesses if _otherwise(guess, last, frame) < 2.0 * _STEADY)]
-    laid = [found for guess in guesses if (found := _lay(guess, frame, one, other)) is not None]
+    laid = [found for guess in guesses if (found := _lay(guess, frame, first, other)) is not None]
     return _surest(laid, frame) if last is None else _steadiest(laid, last, frame)
 
 
 def _surest(laid: Sequence[_Laid], frame: Frame) -> FloatArray | None:
     """Return the motion that fits best; None where that is little, or another one fits as well."""
-    best = max(laid, key=lambda one: one.fit, default=None)
+    best = max(laid, key=lambda found: found.fit, default=None)
     if best is None or best.fit < _LEAST_FIRST:
         return None
-    others = (one for one in laid if not _is_same_motion(one.motion, best.motion, frame))
-    return None if any(one.rivals(best) for one in others) else best.motion
+    others = (found for found in laid if not _is_same_motion(found.motion, best.motion, frame))
+    return None if any(found.rivals(best) for found in others) else best.motion
 
 
 def _steadiest(laid: Sequence[_Laid], last: FloatArray, frame: Frame) -> FloatArray | None:
     """Return the motion that fits best, and goes on as the one before; None where that is little."""
     worth = [
-        (one.fit - _OTHERWISE * off, one) for one in laid if (off := _otherwise(one.motion, last, frame)) < _STEADY
+        (found.fit - _OTHERWISE * off, found)
+        for found in laid
+        if (off := _otherwise(found.motion, last, frame)) < _STEADY
     ]
     fit, best = max(worth, key=lambda pair: pair[0], default=(0.0, None))
     return best.motion if best is not None and fit >= _LEAST_AGAIN else None
 
 
-def _lay(guess: FloatArray, frame: Frame, one: TracedMask, other: TracedMask) -> _Laid | None:
+def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Laid | None:
     """Lay a mask on another, near a rough motion; None where they hardly share a road."""
-    found = _refine(guess, frame, other.scene, one.roads)
+    found = _refine(guess, frame, other.scene, first.roads)
     if found is None:
         return None
     there, motion = found
-    back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, one.scene, other.roads)
+    back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, first.scene, other.roads)
     return _Laid(motion, 0.5 * (there + back), _shared(motion, frame))
 
 
@@ -243,7 +245,7 @@ class TracedMask:
         return cls(mask, scene, _buckets(graph))
 
 
-def overlay(one: TracedMask, other: TracedMask) -> list[tuple[FloatArray, float]]:
+def overlay(first: TracedMask, other: TracedMask) -> list[tuple[FloatArray, float]]:
     """Lay a mask on another that was taken anywhere near, either way up, where their roads agree.
 
     Where streets are alike there may be two such places, a block apart; none means that they do not overlap.
@@ -251,19 +253,19 @@ def overlay(one: TracedMask, other: TracedMask) -> list[tuple[FloatArray, float]
     Returns
     -------
     list of ((3, 3) float64, float)
-        Pixel of `other` to pixel of `one`, and how sure that is: the share of roads that agree, of the mask that has
-        less, times that of the frame that both see. The surest first.
+        Pixel of `other` to pixel of `first`, and how sure that is: the share of roads that agree, of the mask that has
+        less, times the share of the frame that both see. The surest first.
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
     found: list[tuple[FloatArray, float]] = []
     for turn in (np.eye(3), _half_turn(frame)):
         seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
-        for guess in _rough_motions(one.mask, seen, 4):
-            laid = _refine(guess @ turn, frame, other.scene, one.roads)
+        for guess in _rough_motions(first.mask, seen, 4):
+            laid = _refine(guess @ turn, frame, other.scene, first.roads)
             if laid is None or laid[0] < _LEAST_SHARE:
                 continue
-            back = _agreement(np.asarray(np.linalg.inv(laid[1]), float), frame, one.scene, other.roads)
+            back = _agreement(np.asarray(np.linalg.inv(laid[1]), float), frame, first.scene, other.roads)
             shared = _shared(laid[1], frame)
             if back >= _LEAST_SHARE and shared >= _LEAST_SHARED:
                 found.append((laid[1], min(laid[0], back) * shared))
@@ -311,8 +313,8 @@ def _rough_covariance(frame: Frame) -> FloatArray:
     """Return how unsure a rough motion is: (8, 8) of the corners, which mostly shift, turn and grow together."""
     unit = frame.half_diagonal
     x, y = ((frame.plane_corners - frame.plane_center) / unit).T
-    zero, one = np.zeros(4), np.ones(4)
-    modes = np.stack([np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (x, y), (-y, x))])
+    zeros, ones = np.zeros(4), np.ones(4)
+    modes = np.stack([np.stack(pair, axis=1).ravel() for pair in ((ones, zeros), (zeros, ones), (x, y), (-y, x))])
     sigmas = np.array([_SHIFT_CELLS * max(frame.width, frame.height) / _ROUGH_SIDE] * 2 + [_LINEAR_SIGMA * unit] * 2)
     return np.asarray((modes.T * sigmas**2) @ modes + np.eye(8) * (_CORNER_SIGMA * unit) ** 2)
 
@@ -332,7 +334,7 @@ def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBucket
 
 
 def _buckets(graph: RoadGraph) -> RoadBuckets:
-    """Sort the roads of a traced mask into buckets, so that they can be looked up like those of a map."""
+    """Sort the roads of a traced mask into buckets, so that they can be looked up like a map's."""
     parts = [np.hstack([line[:-1], line[1:]]) for line in graph.polylines()]
     segments = np.ascontiguousarray(np.concatenate(parts), np.float32)
     ends = segments.reshape(-1, 2)
@@ -349,7 +351,7 @@ def _buckets(graph: RoadGraph) -> RoadBuckets:
 def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[FloatArray]:
     """Return the shifts at which the roads of two masks cover each other most: the best ones, each of another turn.
 
-    Of more than two, the two best shifts of each turn are among them.
+    The two best shifts of each turn are among them.
     """
     height, width = mask.shape
     scale = _ROUGH_SIDE / max(height, width)
@@ -378,7 +380,7 @@ def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[Flo
             found.append((float(worth[row, column]), motion))
             around = (np.abs(rows - rows[row]) < 8)[:, None] & (np.abs(columns - columns[column]) < 8)[None]
             worth[around] = -np.inf
-    found.sort(key=lambda one: -one[0])
+    found.sort(key=lambda pair: -pair[0])
     return [motion for _, motion in found[:count]]
 
 

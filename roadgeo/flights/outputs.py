@@ -26,6 +26,13 @@ __all__ = ["WRITERS", "to_csv", "to_geojson", "to_gpx", "write_geopackage"]
 _CE90 = math.sqrt(-math.log(0.1))
 
 
+#: Columns of a frame in layers: keys of `Row.to_dict`.
+_COLUMNS = (
+    *("frame", "name", "time", "time_s", "status", "sigma_m", "gsd_m", "heading_deg", "log10_odds"),
+    *("reference", "reason"),
+)
+
+
 def to_csv(rows: Sequence[Row]) -> str:
     """Return a table, one row a frame; columns that MISB ST 0601 knows have its names and units."""
     text = io.StringIO()
@@ -41,7 +48,7 @@ def to_csv(rows: Sequence[Row]) -> str:
         at = ["", ""] if row.center is None else [f"{row.center[1]:.8f}", f"{row.center[0]:.8f}"]
         ring = [""] * 8 if row.footprint is None else [f"{v:.8f}" for lon, lat in row.footprint for v in (lat, lon)]
         values = [_CE90 * row.sigma_m, row.sigma_m, row.gsd_m, row.heading_deg, row.log10_odds]
-        told = ["" if math.isnan(value) else f"{value:.4f}" for value in values]
+        measured = ["" if math.isnan(value) else f"{value:.4f}" for value in values]
         table.writerow(
             [
                 row.number,
@@ -51,7 +58,7 @@ def to_csv(rows: Sequence[Row]) -> str:
                 row.status,
                 *at,
                 *ring,
-                *told,
+                *measured,
                 *_sensor(row),
                 row.known_at,
                 table_cell(row.reason),
@@ -74,11 +81,7 @@ def to_geojson(rows: Sequence[Row]) -> str:
         {
             "type": "Feature",
             "geometry": {"type": "Polygon", "coordinates": [_ring(row)]},
-            "properties": {
-                key: value
-                for key, value in row.to_dict().items()
-                if key not in ("footprint_lonlat", "homography", "center", "camera", "schema")
-            },
+            "properties": {key: row.to_dict()[key] for key in (*_COLUMNS, "known_at", "crs")},
         }
         for row in placed
     ]
@@ -126,19 +129,8 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
     placed = [row for row in rows if row.center is not None]
     if not placed:
         return
-    columns: dict[str, list[Any]] = {
-        "frame": [row.number for row in placed],
-        "name": [row.name for row in placed],
-        "time": [row.to_dict()["time"] for row in placed],
-        "time_s": [row.time_s for row in placed],
-        "status": [row.status for row in placed],
-        "sigma_m": [row.sigma_m for row in placed],
-        "gsd_m": [row.gsd_m for row in placed],
-        "heading_deg": [row.heading_deg for row in placed],
-        "log10_odds": [row.log10_odds for row in placed],
-        "reference": [row.reference for row in placed],
-        "reason": [row.reason for row in placed],
-    }
+    columns: dict[str, list[Any]] = {key: [getattr(row, key) for row in placed] for key in _COLUMNS[1:]}
+    columns = {"frame": [row.number for row in placed], **columns, "time": [row.to_dict()["time"] for row in placed]}
     centers = np.array([row.center for row in placed])
     layers = [
         Layer("footprints", "POLYGON", [row.footprint for row in placed], columns, "EPSG:4326",
@@ -147,9 +139,9 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
     ]  # fmt: skip
     runs = _runs(rows)
     if runs:
-        told = {"first": [run[0].number for run in runs], "last": [run[-1].number for run in runs]}
+        ends = {"first": [run[0].number for run in runs], "last": [run[-1].number for run in runs]}
         lines = [np.array([row.center for row in run]) for run in runs]
-        layers.insert(1, Layer("track", "LINESTRING", lines, told, "EPSG:4326", draw_line("40,40,40", 0.6)))
+        layers.insert(1, Layer("track", "LINESTRING", lines, ends, "EPSG:4326", draw_line("40,40,40", 0.6)))
     write_layers(path, layers)
 
 

@@ -42,7 +42,7 @@ class FilterOptions:
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road.
     radii : tuple of (float, float)
-        Of each step of the adjustment: search radius in metres, and in standard deviations of the
+        Search radius of each step of the adjustment in metres, and in standard deviations of the
         prediction, away; the lesser of the two counts.
     least_radius_m : float
         They are always searched within this radius.
@@ -70,7 +70,7 @@ class Pose:
     corners : (4, 2) float64
         TL, TR, BR, BL on the reference plane, metres.
     covariance : (9, 9) float64
-        Of the corners x0 y0 x1 y1 ..., metres, and of `log_focal`.
+        Covariance of the corners x0 y0 x1 y1 ..., metres, and of `log_focal`.
     frame : Frame
     log_focal : float
         Log of the focal length in halves of the frame's diagonal.
@@ -110,7 +110,7 @@ class Pose:
 
 
 def loosened(pose: Pose, shift_m: float) -> Pose:
-    """Return a frame that may be shifted as a whole by so much besides: root mean square of the distance."""
+    """Return a frame that may lie this far away as a whole besides: root mean square of the distance."""
     covariance = pose.covariance.copy()
     covariance[:8, :8] += 0.5 * shift_m**2 * np.tile(np.eye(2), (4, 4))
     return replace(pose, covariance=covariance)
@@ -235,7 +235,7 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
-    """Lay a frame's roads on those of the map, starting from a predicted pose; None where there are too few."""
+    """Lay a frame's roads on the map's, starting from a predicted pose; None where there are too few."""
     local, gsd = _Local.of(pose), pose.gsd_m
     p = local.parameters(pose.corners)
     corners = local.corners

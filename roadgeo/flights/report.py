@@ -86,9 +86,9 @@ def render_flight(
     Parameters
     ----------
     rows
-        Of the same frames.
+        Rows of the same frames.
     pictures : mapping, optional
-        Of frame number to a picture as data (see `Thumbnails`).
+        Frame number to a picture as data (see `Thumbnails`).
     """
     counts = Counter(row.status for row in rows)
     states = ", ".join(f"{counts[status]} {status}" for status in _SIGNS if counts[status])
@@ -98,7 +98,8 @@ def render_flight(
         why = html.escape(rows[-1].reason if rows else "no frames")
         return render_page(title, header, f"<main><aside><p>The flight was not located: {why}</p></aside></main>")
     # Footprints in metres from the corner of the map that is shown.
-    there = [k for k, one in enumerate(tracked) if one.reference is not None and one.reference.name == reference.name]
+    maps = [frame.reference for frame in tracked]
+    there = [k for k, known in enumerate(maps) if known is not None and known.name == reference.name]
     corners = {k: _corners(tracked[k]) for k in there}
     window = Window.around(np.concatenate(list(corners.values())), _MARGIN).no_longer_than(2.0)
     rings = {k: window.place(ring) for k, ring in corners.items()}
@@ -121,16 +122,17 @@ def render_flight(
 
 def _usual_map(tracked: Sequence[Tracked]) -> Reference | None:
     """Return the map that holds most of the frames; None where no frame has a place."""
-    names = Counter(one.reference.name for one in tracked if one.reference is not None)
+    maps = [frame.reference for frame in tracked if frame.reference is not None]
+    names = Counter(reference.name for reference in maps)
     usual = names.most_common(1)[0][0] if names else ""
-    return next((one.reference for one in tracked if one.reference is not None and one.reference.name == usual), None)
+    return next((reference for reference in maps if reference.name == usual), None)
 
 
-def _corners(one: Tracked) -> FloatArray:
+def _corners(tracked: Tracked) -> FloatArray:
     """Return the footprint (4, 2) of a frame in the CRS of its map."""
-    assert one.pose is not None  # noqa: S101 - only such frames are drawn
-    assert one.reference is not None  # noqa: S101
-    return one.reference.index.plane.to_crs(one.pose.corners)
+    assert tracked.pose is not None  # noqa: S101 - only such frames are drawn
+    assert tracked.reference is not None  # noqa: S101
+    return tracked.reference.index.plane.to_crs(tracked.pose.corners)
 
 
 def _player(rows: Sequence[Row]) -> str:

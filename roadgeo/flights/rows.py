@@ -99,16 +99,16 @@ class Row:
 
 def make_rows(tracked: Sequence[Tracked], begun: datetime | None = None, focal_px: float | None = None) -> list[Row]:
     """Describe frames; `begun` is the time of the first one, `focal_px` the camera's focal length."""
-    return [_row(one, begun, focal_px) for one in tracked]
+    return [_row(frame, begun, focal_px) for frame in tracked]
 
 
-def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
-    frame = one.frame
+def _row(tracked: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
+    frame = tracked.frame
     when = None if begun is None else begun.astimezone(UTC) + timedelta(seconds=frame.time_s)
-    bare = (frame.number, frame.name, frame.time_s, when, one.status, one.reason, one.known_at)
-    if one.pose is None or one.reference is None:
+    bare = (frame.number, frame.name, frame.time_s, when, tracked.status, tracked.reason, tracked.known_at)
+    if tracked.pose is None or tracked.reference is None:
         return Row(*bare)
-    plane, pose = one.reference.index.plane, one.pose
+    plane, pose = tracked.reference.index.plane, tracked.pose
     ground = plane.to_crs(np.vstack([pose.corners, pose.center]))
     lonlat = to_lonlat(plane.crs, ground)
     up = pose.homography.jacobian(pose.frame.center) @ (0.0, -1.0)
@@ -117,13 +117,13 @@ def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
     matrix = plane.to_crs_matrix() @ pose.homography.matrix
     return Row(
         *bare,
-        one.reference.name,
+        tracked.reference.name,
         (float(lonlat[4, 0]), float(lonlat[4, 1])),
         lonlat[:4],
         math.hypot(pose.sigma_m, inexact),
         pose.gsd_m,
         heading % 360.0,
-        one.log10_odds,
+        tracked.log10_odds,
         plane.crs,
         matrix / matrix[2, 2],
         None if focal_px is None else _camera(pose, plane, focal_px),
@@ -131,7 +131,7 @@ def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
 
 
 def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
-    """Find the camera of a focal length behind a frame; None where there is none above the ground."""
+    """Find the camera of a focal length behind a frame; None where it would lie below the ground."""
     size = round(pose.frame.width), round(pose.frame.height)
     found = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], PoseOptions(focal_px=focal_px))
     if found is None:

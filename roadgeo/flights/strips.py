@@ -43,7 +43,7 @@ class StripOptions:
     least_odds : float
         Log10 odds against places nearby by which a frame agrees with the map.
     most_gap : float
-        A link that puts a frame's corners this share of its half diagonal off where the others put them is none.
+        A link is left out if it puts a frame's corners this share of its half diagonal off where the others put them.
     """
 
     start_sigma_m: float = 8.0
@@ -58,14 +58,14 @@ class Link:
 
     Attributes
     ----------
-    one, other : int
+    first, other : int
     motion : (3, 3) float64
-        Pixel of `other` to pixel of `one`.
+        Pixel of `other` to pixel of `first`.
     weight : float
         How sure it is.
     """
 
-    one: int
+    first: int
     other: int
     motion: FloatArray
     weight: float
@@ -90,7 +90,7 @@ def place_strips(
     stills = [frame for frame, _ in frames]
     links = find_links(stills, [grey for _, grey in frames])
     placed: list[Tracked] = []
-    for net, matrices in find_nets([one.frame for one in stills], links, strips):
+    for net, matrices in find_nets([still.frame for still in stills], links, strips):
         order = _along(matrices, stills[net[0]].frame, [stills[k].name for k in net])
         members = [replace(stills[net[k]], number=n, time_s=stills[n].time_s) for n, k in enumerate(order, len(placed))]
         of_net = _Net(members, matrices[order], _within([net[k] for k in order], links), options, strips)
@@ -113,19 +113,19 @@ class _Net:
         tracker, why = Tracker(references, self.options), "no roads are seen"
         for chosen in [range(len(self.frames)), *([k] for k in range(len(self.frames)) if len(self.frames) > 1)]:
             placed, said = self._locate(tracker, list(chosen), references)
-            placed = [one for one in placed if self._stands(one)]
+            placed = [tracked for tracked in placed if self._stands(tracked)]
             if placed:
-                surest = max(placed, key=lambda one: one.log10_odds)
+                surest = max(placed, key=lambda tracked: tracked.log10_odds)
                 return self._spread(tracker, self.frames.index(surest.frame), surest)
             why = said if len(chosen) > 1 or len(self.frames) == 1 else why
-        return [Tracked(one, "lost", why, one.number) for one in self.frames]
+        return [Tracked(frame, "lost", why, frame.number) for frame in self.frames]
 
     def _locate(
         self, tracker: Tracker, chosen: Sequence[int], references: Sequence[Reference]
     ) -> tuple[list[Tracked], str]:
         """Return the frames that were placed by the mosaic of some; none, and why."""
         frames = [self.frames[k] for k in chosen]
-        masks = [one.mask for one in frames]
+        masks = [frame.mask for frame in frames]
         if not any(mask.roads.any() for mask in masks):
             return [], "no roads are seen"
         mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks), self.options.mosaic)
@@ -138,33 +138,35 @@ class _Net:
         )
         if not location.located:
             return [], f"{len(frames)} frames together: {location.reason}" if len(frames) > 1 else location.reason
-        placed = [one for one in tracker.place(location, mosaic, frames) if one.status == "located"]
+        placed = [tracked for tracked in tracker.place(location, mosaic, frames) if tracked.status == "located"]
         return placed, "a place was found, but the frames by themselves do not agree"
 
     def _spread(self, tracker: Tracker, first: int, surest: Tracked) -> list[Tracked]:
         """Place frames beside those that are placed, along the surest links first."""
         known = {first: surest}
-        left = sorted(self.links, key=lambda one: -one.weight)
-        while (link := next((one for one in left if (one.one in known) != (one.other in known)), None)) is not None:
+        left = sorted(self.links, key=lambda link: -link.weight)
+        while (
+            link := next((link for link in left if (link.first in known) != (link.other in known)), None)
+        ) is not None:
             left.remove(link)
-            at, to = (link.one, link.other) if link.one in known else (link.other, link.one)
-            motion = link.motion if at == link.one else np.asarray(np.linalg.inv(link.motion), float)
+            at, to = (link.first, link.other) if link.first in known else (link.other, link.first)
+            motion = link.motion if at == link.first else np.asarray(np.linalg.inv(link.motion), float)
             frame = replace(self.frames[to], motion=motion, motion_px=self.strips.link_px)
             beside = tracker.place_beside(known[at], frame)
             if self._stands(beside):
                 known[to] = beside
         why = "its roads do not agree with the map where its neighbours put it"
-        return [known.get(k, Tracked(one, "lost", why, one.number)) for k, one in enumerate(self.frames)]
+        return [known.get(k, Tracked(frame, "lost", why, frame.number)) for k, frame in enumerate(self.frames)]
 
-    def _stands(self, one: Tracked) -> bool:
+    def _stands(self, tracked: Tracked) -> bool:
         """Whether a frame is where it was put, and not a block beside; a frame without roads is."""
-        if one.status == "predicted":
-            return math.isnan(one.log10_odds)
-        if one.status != "located" or one.pose is None or one.reference is None:
+        if tracked.status == "predicted":
+            return math.isnan(tracked.log10_odds)
+        if tracked.status != "located" or tracked.pose is None or tracked.reference is None:
             return False
-        scene = trace_query(one.frame.mask)[0]
-        start = one.pose.homography.matrix @ PIXEL_TO_PLANE
-        checked = check_place(start / start[2, 2], scene, one.reference.index, _CHECK)
+        scene = trace_query(tracked.frame.mask)[0]
+        start = tracked.pose.homography.matrix @ PIXEL_TO_PLANE
+        checked = check_place(start / start[2, 2], scene, tracked.reference.index, _CHECK)
         return checked.verdict == "agrees"
 
 
@@ -178,7 +180,7 @@ def _road_px(masks: Sequence[RoadMask]) -> float:
 
 def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) -> list[Link]:
     """Lay each frame on each other: by their pictures where both have one, otherwise by their roads."""
-    traced = [TracedMask.of(one.mask) if grey is None else None for one, grey in zip(frames, greys, strict=True)]
+    traced = [TracedMask.of(frame.mask) if grey is None else None for frame, grey in zip(frames, greys, strict=True)]
     links = []
     for i, j in combinations(range(len(frames)), 2):
         if frames[i].mask.shape != frames[j].mask.shape:
@@ -188,12 +190,12 @@ def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) 
 
 
 def _link(
-    one: TracedMask | None, other: TracedMask | None, grey: AnyArray | None, other_grey: AnyArray | None
+    first: TracedMask | None, other: TracedMask | None, grey: AnyArray | None, other_grey: AnyArray | None
 ) -> list[tuple[FloatArray, float]]:
     if grey is not None and other_grey is not None:
         motion = between_images(grey, other_grey)
         return [] if motion is None else [(motion, 1.0)]
-    return [] if one is None or other is None else overlay(one, other)
+    return [] if first is None or other is None else overlay(first, other)
 
 
 def find_nets(
@@ -204,17 +206,17 @@ def find_nets(
     nets = [[k] for k in range(len(frames))]
     at: list[FloatArray] = [np.eye(3) for _ in frames]
     kept: list[Link] = []
-    for link in sorted(links, key=lambda one: -one.weight):
-        mine = next(net for net in nets if link.one in net)
+    for link in sorted(links, key=lambda link: -link.weight):
+        mine = next(net for net in nets if link.first in net)
         theirs = next(net for net in nets if link.other in net)
         if mine is not theirs:  # the surest links join nets: those join as rigid wholes
-            move = at[link.one] @ link.motion @ np.linalg.inv(at[link.other])
+            move = at[link.first] @ link.motion @ np.linalg.inv(at[link.other])
             for k in theirs:
                 at[k] = move @ at[k]
                 at[k] = at[k] / np.cbrt(np.linalg.det(at[k]))
             mine += theirs
             nets.remove(theirs)
-        elif _gap(at[link.one] @ link.motion, at[link.other], frames[link.other]) > options.most_gap:
+        elif _gap(at[link.first] @ link.motion, at[link.other], frames[link.other]) > options.most_gap:
             continue
         kept.append(link)
     nets.sort(key=len, reverse=True)
@@ -224,12 +226,12 @@ def find_nets(
 def _within(net: Sequence[int], links: Sequence[Link]) -> list[Link]:
     """Return the links of a net, numbered in it."""
     number = {k: n for n, k in enumerate(net)}
-    return [replace(one, one=number[one.one], other=number[one.other]) for one in links if one.one in number]
+    return [replace(link, first=number[link.first], other=number[link.other]) for link in links if link.first in number]
 
 
 def _gap(a: FloatArray, b: FloatArray, frame: Frame) -> float:
     """Return how far apart two homographies put a frame's corners, in half diagonals of where the second puts them."""
-    there, here = (Homography(one).facing(frame.center)(frame.corners) for one in (a, b))
+    there, here = (Homography(matrix).facing(frame.center)(frame.corners) for matrix in (a, b))
     size = np.hypot(*(here[2:] - here[:2]).T).mean() / 2.0
     gap = np.hypot(*(there - here).T).max() / size
     return float(gap) if np.isfinite(gap) else np.inf
@@ -249,14 +251,14 @@ def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> 
     local = local / local[:, 2:, 2:]
     scale = np.abs(local[0, :2, :2]).max()
     base = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.6
-    points = np.stack([Homography(np.linalg.inv(to_pixel) @ one.motion @ to_pixel)(base) for one in links])
-    ones, others = (np.array([getattr(link, name) for link in links]) for name in ("one", "other"))
+    points = np.stack([Homography(np.linalg.inv(to_pixel) @ link.motion @ to_pixel)(base) for link in links])
+    firsts, others = (np.array([getattr(link, name) for link in links]) for name in ("first", "other"))
     weight = np.sqrt([link.weight for link in links])[:, None, None] / scale
 
     def residuals(free: FloatArray) -> FloatArray:
         moved = local.copy()
         moved[1:].reshape(-1, 9)[:, :8] += free.reshape(-1, 8) * step
-        gap = map_each(moved[ones], points) - map_each(moved[others], np.broadcast_to(base, points.shape))
+        gap = map_each(moved[firsts], points) - map_each(moved[others], np.broadcast_to(base, points.shape))
         return np.asarray((weight * gap).ravel())
 
     step = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale]) * scale
@@ -269,7 +271,7 @@ def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> 
 
 def _along(matrices: FloatArray, frame: Frame, names: Sequence[str]) -> list[int]:
     """Return the order of frames along the line on which they lie, from the end whose name comes first."""
-    middles = np.stack([Homography(one).facing(frame.center)(frame.center) for one in matrices])
+    middles = np.stack([Homography(matrix).facing(frame.center)(frame.center) for matrix in matrices])
     away = middles - middles.mean(axis=0)
     axis = np.linalg.svd(away)[2][0]
     order: list[int] = np.argsort(away @ axis, kind="stable").tolist()

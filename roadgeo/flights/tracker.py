@@ -1,7 +1,7 @@
 """The way of a flight: frames are laid together until the map knows them, then each is followed from the one before.
 
 While nothing is known, each frame is laid to those before, and the mosaic is located like any mask: the evidence is
-that of the engine, and each further look takes its share off. From there on a frame is predicted by its motion, laid on
+the engine's, and each further look takes its share off. From there on a frame is predicted by its motion, laid on
 the roads nearby, and compared with places nearby. Frames that do not agree are taken for predicted; where several in a
 row do not, the flight is lost, and the search begins anew with them.
 """
@@ -49,7 +49,7 @@ class TrackOptions:
     locate : LocateOptions
         How mosaics are located; the hints are of the frames.
     most_frames : int
-        Of more frames that wait for a place, the latest are laid together.
+        The latest of the frames that wait for a place are laid together, up to this number.
     fewest_intersections, more_intersections, more_frames : int
         A mosaic is located once it shows the first number of intersections, and again after the second number of more
         intersections, or the third of more frames.
@@ -238,7 +238,7 @@ class Tracker:
         self._pose, self._reference = None, None
         self._window, self._doubtful = list(doubtful), []
         self._forget()
-        return [Tracked(one.frame, "lost", why, known_at) for one in doubtful]
+        return [Tracked(doubt.frame, "lost", why, known_at) for doubt in doubtful]
 
     def _no_candidates(self) -> Candidates:
         return Candidates(self.references, self.options.candidates)
@@ -257,8 +257,8 @@ class Tracker:
             self._window = []
             self._forget()
         self._window = [*self._window, waiting][-self.options.most_frames :]
-        masks = [one.frame.mask for one in self._window]
-        mosaic = lay_together(masks, [_motion(one) for one in self._window], _road_px(masks), self.options.mosaic)
+        masks = [member.frame.mask for member in self._window]
+        mosaic = lay_together(masks, [_motion(member) for member in self._window], _road_px(masks), self.options.mosaic)
         if mosaic is None:
             self._window = [waiting]
             self._forget()
@@ -273,7 +273,7 @@ class Tracker:
         searched = n_seen >= least or self._waited >= self.options.more_frames
         if searched:
             self._looked_at, self._waited = n_seen, 0
-        look = Look(query, mosaic, [one.frame.number for one in self._window], searched)
+        look = Look(query, mosaic, [member.frame.number for member in self._window], searched)
         location = self._candidates.look(look, self.look_options(mosaic, masks))
         if not location.located:
             return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
@@ -297,7 +297,7 @@ class Tracker:
 
     def place(self, location: Location, mosaic: Mosaic, frames: Sequence[FlightFrame]) -> list[Tracked]:
         """Place frames whose mosaic was located, each by itself; nothing where most of them do not agree."""
-        self._window = [_Waiting(one, _trace(one.mask)) for one in frames]
+        self._window = [_Waiting(frame, _trace(frame.mask)) for frame in frames]
         return self._settle(location, mosaic)
 
     def place_beside(self, known: Tracked, frame: FlightFrame) -> Tracked:
@@ -307,7 +307,7 @@ class Tracker:
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
-        reference = next(one for one in self.references if one.name == location.reference)
+        reference = next(known for known in self.references if known.name == location.reference)
         plane = reference.index.plane
         first, last = self._window[0].frame, self._window[-1].frame
         self._reference = reference
@@ -318,7 +318,7 @@ class Tracker:
             if np.isfinite(corners).all():
                 here = start(corners, frame, np.eye(8) * self.options.start_sigma_m**2 / 2.0)
                 placed.append(self._judge(waiting, here, last.number, "located"))
-        agreed = sum(one.status == "located" for one in placed)
+        agreed = sum(tracked.status == "located" for tracked in placed)
         if len(placed) < len(self._window) or agreed < 0.5 * len(placed):
             self._pose, self._reference = None, None
             return []
@@ -335,7 +335,7 @@ class Tracker:
         A mosaic bends: frames far from the roads that located it may be anywhere. Frames of an archive, which have
         neither motion nor order, stay.
         """
-        odds = [one.log10_odds if one.status == "located" else -math.inf for one in placed]
+        odds = [tracked.log10_odds if tracked.status == "located" else -math.inf for tracked in placed]
         surest = int(np.argmax(odds))
         for way, there in ((1, len(placed)), (-1, -1)):
             for k in range(surest + way, there, way):
@@ -360,7 +360,7 @@ def track(
     """Follow a flight to its end; return the final state of each frame, in order."""
     known: dict[int, Tracked] = {}
     for _, news in follow(frames, references, options):
-        known.update({one.frame.number: one for one in news})
+        known.update({tracked.frame.number: tracked for tracked in news})
     return [known[number] for number in sorted(known)]
 
 

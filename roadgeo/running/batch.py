@@ -180,8 +180,8 @@ class Locating:
         started = perf_counter()
         paths = _resolve(self.references)
         references = [open_reference(path) for path in paths]
-        digests = [(one.name, reference_digest(path)) for one, path in zip(references, paths, strict=True)]
-        return Asked(references, digests, perf_counter() - started, self._told())
+        digests = [(reference.name, reference_digest(path)) for reference, path in zip(references, paths, strict=True)]
+        return Asked(references, digests, perf_counter() - started, self._changes())
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
@@ -192,7 +192,7 @@ class Locating:
         from roadgeo.location import Location, Reason
 
         location = Location(
-            task.query, "error", reason, options=self._told(), command=self._command(task), reason_code=Reason[code]
+            task.query, "error", reason, options=self._changes(), command=self._command(task), reason_code=Reason[code]
         )
         return Outcome("error", location.to_dict())
 
@@ -205,17 +205,17 @@ class Locating:
         fused = self.options.reading.fused_with
         return shlex.join(["roadgeo", "locate", task.query, *fused, *drawn, *self.options.command])
 
-    def _told(self) -> dict[str, Any]:
+    def _changes(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, as plain values for the JSON."""
         usual = BatchOptions()
         reading = replace(self.options.reading, threads=ReadOptions.threads)
-        told = {
+        changes = {
             **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
             **changed_options(reading, usual.reading),
             **{name: value for name in ("exif", "dem") if (value := getattr(self.options, name))},
             **changed_options(self.outputs.image, usual.outputs.image),
         }
-        plain: dict[str, Any] = json.loads(json.dumps(told))
+        plain: dict[str, Any] = json.loads(json.dumps(changes))
         return plain
 
     def do(self, task: Task, asked: Asked, how: Locate | None = None) -> Outcome:
@@ -295,7 +295,7 @@ class Locating:
         paths, photo = output_paths(self.out_dir, task.stem), self.options.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
-        indexes = [one.index_of(location) for one in asked.references]
+        indexes = [reference.index_of(location) for reference in asked.references]
         outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
         written = write_location(location, mask, paths, outputs, photo, indexes, explanation)
         return Outcome(
@@ -319,7 +319,7 @@ class Locating:
 
 
 def _without_views(outputs: OutputOptions) -> OutputOptions:
-    """Leave out what shows the roads of a mask: there are none."""
+    """Leave out the views of a mask's roads: it has no roads."""
     from roadgeo.outputs.registry import EXPLANATION, EXPLANATION_PICTURE
 
     views = {REPORT.name, EXPLANATION.name, EXPLANATION_PICTURE.name}
@@ -348,21 +348,16 @@ class Asked:
 
 
 def changed_options(options: Any, usual: Any) -> dict[str, Any]:
-    """Return the fields of options that differ from the usual ones, as JSON holds them; of nested ones likewise."""
-    changed = {}
-    for one in dataclasses.fields(options):
-        value, default = getattr(options, one.name), getattr(usual, one.name)
-        if value != default:
-            alike = dataclasses.is_dataclass(value) and type(value) is type(default)
-            changed[one.name] = changed_options(value, default) if alike else _as_json(value)
-    return changed
+    """Return the fields of options that differ from the usual ones as plain values; of nested ones likewise."""
+    return _changed(dataclasses.asdict(options), dataclasses.asdict(usual))
 
 
-def _as_json(value: Any) -> Any:
-    """Return an option's value, with the options within it, as JSON holds it."""
-    if isinstance(value, tuple):
-        return [_as_json(one) for one in value]
-    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
+def _changed(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    changed = {name: value for name, value in values.items() if value != usual.get(name)}
+    return {
+        name: _changed(value, usual[name]) if isinstance(value, dict) and isinstance(usual.get(name), dict) else value
+        for name, value in changed.items()
+    }
 
 
 #: Meaning of each kind of error for programs: names in `location.Reason`.
@@ -438,15 +433,19 @@ def write_overview(
         from roadgeo.outputs.report import Entry, write_batch
 
         reports = [REPORT.path(folder, task.stem) for task in tasks]
-        there = [path.exists() and one.status != "error" for path, one in zip(reports, outcomes, strict=True)]
+        there = [path.exists() and outcome.status != "error" for path, outcome in zip(reports, outcomes, strict=True)]
         links = [path.name if here else "" for path, here in zip(reports, there, strict=True)]
         files.append(folder / "roadgeo_report.html")
-        indexes = [index for one in references for index in one.indexes_at(_places_on(one.name, documents))]
+        indexes = [
+            index for reference in references for index in reference.indexes_at(_places_on(reference.name, documents))
+        ]
         write_batch(files[-1], list(map(Entry, documents, links)), indexes)
     return files
 
 
 def _places_on(name: str, documents: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
     """Return longitude and latitude of a place on a reference."""
-    centers = [one["center"] for one in documents if one.get("center") and one.get("reference") == name]
+    centers = [
+        document["center"] for document in documents if document.get("center") and document.get("reference") == name
+    ]
     return [(center["lon"], center["lat"]) for center in centers]

@@ -15,6 +15,7 @@ import numpy as np
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Location, Place, Reason, Seconds
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
@@ -123,7 +124,7 @@ def _discount(location: Location, what: str, tried: int, options: LocateOptions)
         return _refused(location, few)
     reason = f"{location.reason}; seen in another way ({what}) than at first"
     center = None if location.center is None else replace(location.center, log10_odds=odds)
-    others = tuple(_less_sure(one, off) for one in location.alternatives)
+    others = tuple(_less_sure(place, off) for place in location.alternatives)
     runner_up = location.runner_up and _less_sure(location.runner_up, off)
     return replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others)
 
@@ -151,13 +152,15 @@ def _refused(location: Location, reason: str) -> Location:
 def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
     """Return the best answer, the first of equals; a rival elsewhere that is almost as sure makes it ambiguous."""
     rank = {"located": 2, "ambiguous": 1, "not_located": 0}
-    best = max(sightings, key=lambda one: (rank[one.location.status], one.location.log10_odds or -math.inf))
-    locations = [one.location for one in sightings]
-    location = replace(best.location, seconds=total_seconds(*(one.seconds for one in locations)))
+    best = max(
+        sightings, key=lambda sighting: (rank[sighting.location.status], sighting.location.log10_odds or -math.inf)
+    )
+    locations = [sighting.location for sighting in sightings]
+    location = replace(best.location, seconds=total_seconds(*(sighting.location.seconds for sighting in sightings)))
     if len(sightings) > 1 and location.status == "not_located":
         location = replace(location, reason=f"{location.reason} (seen in {len(sightings)} ways)")
-    rivals = [one for one in locations if one is not best.location and _elsewhere(one, location)]
-    rival = max(rivals, key=lambda one: one.log10_odds or -math.inf, default=None)
+    rivals = [found for found in locations if found is not best.location and _elsewhere(found, location)]
+    rival = max(rivals, key=lambda found: found.log10_odds or -math.inf, default=None)
     if location.located and rival is not None:
         lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
         if lead < options.min_margin:
@@ -180,11 +183,9 @@ def total_seconds(*spent: Seconds) -> Seconds:
     return replace(spent[0], **{step: sum(getattr(seconds, step) for seconds in spent) for step in steps})
 
 
-def _elsewhere(one: Location, best: Location) -> bool:
+def _elsewhere(other: Location, best: Location) -> bool:
     """Whether a location, sure or ambiguous, lies more than half a frame from another."""
-    if one.center is None or best.center is None or best.footprint is None:
+    if other.center is None or best.center is None or best.footprint is None:
         return False
-    east = math.radians(one.center.lon - best.center.lon) * math.cos(math.radians(best.center.lat))
-    north = math.radians(one.center.lat - best.center.lat)
-    side = float(np.hypot(*(best.footprint[1] - best.footprint[0])))
-    return 6.371e6 * math.hypot(east, north) > 0.5 * side
+    apart_m = metres_apart(*(np.array([place.lon, place.lat]) for place in (other.center, best.center)))
+    return bool(apart_m > 0.5 * np.hypot(*(best.footprint[1] - best.footprint[0])))

@@ -33,13 +33,13 @@ class ReadOptions:
     fused_with : tuple of str
         Further images of the same frame, fused with each query.
     threads : int
-        Of a model; fixed, so that results are the same on every run.
+        Threads of a model; fixed, so that results are the same on every run.
     mirror : "tell", "never" or "allow"
         For a refused mask that would be located turned over: whether that is mentioned, not tried, or the answer.
     units : "auto", "pixels" or "metres"
-        Of roads that come as lines (see `sources.drawn_roads`).
+        Unit of roads that come as lines (see `sources.drawn_roads`).
     layer : str or None
-        Of a file of such roads that has several.
+        Layer of such roads, where their file has several.
     aspect : float, "unknown" or None
         How many times a pixel of a mask is as wide as high; None: once.
     bands : (3,) tuple of int, or None

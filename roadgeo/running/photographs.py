@@ -1,6 +1,6 @@
-"""A photograph, or several of one frame: shown to segmenters at some scales, in some ways, and located by what is seen.
+"""A photograph, or several of one frame, shown to segmenters at some scales, in some ways, and located by their roads.
 
-What a segmenter sees is kept. It is looked at with several thresholds and, where the size of a pixel is unknown, at
+Probability maps are kept. They are looked at with several thresholds and, where the size of a pixel is unknown, at
 several scales.
 """
 
@@ -46,26 +46,26 @@ _MAX_SCALES = 3
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 #: In a second way a model is shown a photograph twice as fine, a step of the scales that are tried blind, and the mean
-#: of the log odds counts. Of labelled tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .950
+#: of the log odds counts. On labelled tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .950
 #: and .869 at 0.5 m, .949 and .892 of both (turned by half instead: .923 and .878). Where its pixels are not as fine it
 #: is turned by half.
 _FINER, _WAYS, _ENLARGED = 2.0, 2, 1.1
-_MANY_PIXELS = 4_000_000  # shown to a model in one way first: so large a scene is mostly located by that
+_MANY_PIXELS = 4_000_000  # shown to a model in one way first: a scene of that size is mostly located so
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 
 @dataclass(frozen=True)
 class Look:
-    """One look at what segmenters see in a photograph.
+    """One look at a photograph through segmenters.
 
     Attributes
     ----------
     rank : int
-        Of its scale among those worth trying, the most promising first.
+        Rank of its scale among the scales worth trying, the most promising first.
     finer : float
         How many times finer than that the photograph is shown.
     ways : int or None
-        In how many ways it is shown to a model; None: as many as each model's card says.
+        Number of ways in which a model sees it; None: the number on each model's card.
     lower : bool
         At a threshold lower than the model's own.
     note : str
@@ -85,7 +85,7 @@ class Frame:
     Attributes
     ----------
     own : (H, W)
-        Of the photograph; of its mask, where it is large.
+        Size of the photograph, or of its mask where it is large.
     grid : (H, W)
         On which roads are traced.
     coarser : float
@@ -110,7 +110,7 @@ class Frame:
         self.networks = {
             name: load_model(name, reading.class_name, reading.threads) for name in self.names if not _is_plugin(name)
         }
-        #: What was seen, by photograph, segmenter, scale and number of ways.
+        #: Probability of road by photograph, segmenter, scale and number of ways.
         self._seen: dict[tuple[str, str, float, int], ProbabilityMap] = {}
         k = max(1, math.ceil(math.sqrt(self.first.width * self.first.height / _MAX_GRID_PIXELS)))
         self.own = round(self.first.height / k), round(self.first.width / k)
@@ -144,7 +144,8 @@ class Frame:
         """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best.
 
         A model is shown it in one way first where that was done already, but not at the next finer scale, and where
-        there is much to show. Where one scale is known, what was shown at two scales together is looked at alone, too.
+        there is much to show. Where one scale is known, the two scales that were shown together are looked at alone
+        as well.
         """
         best, shown = self.scale(0), {scale for _, _, scale, _ in self._seen}
         has_models = bool(self.networks) and not self.masks.keys() >= set(self.paths)
@@ -168,7 +169,7 @@ class Frame:
         Raises
         ------
         MaskError
-            There are none.
+            It shows no roads.
         """
         scale = look.finer * self.scale(look.rank)
         seen = self.see(scale, look.ways)
@@ -251,7 +252,7 @@ def locate_photograph(
     how: Locate,
     say: Say,
 ) -> Sighting:
-    """Locate a photograph, or several of one frame, by what segmenters see.
+    """Locate a photograph, or several of one frame, by the roads that segmenters see.
 
     Raises
     ------

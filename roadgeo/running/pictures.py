@@ -29,14 +29,14 @@ def read_picture(picture: Any) -> str | AnyArray:
     Parameters
     ----------
     picture : path, array, PIL image, xarray DataArray or rasterio dataset
-        Of an array with three axes the short one (up to 16) holds the bands: first as rasterio has it (C, H, W), or
+        The short axis (up to 16) of an array with three holds the bands: first as rasterio has it (C, H, W), or
         last as others do (H, W, C). A dataset that is a file is read as that file. Pixels that are transparent, masked
         or nodata were not observed. A PIL image is turned upright, as `PIL.ImageOps.exif_transpose` does.
 
     Raises
     ------
     MaskError
-        It is none of these.
+        It is something else.
     """
     if isinstance(picture, str | os.PathLike):
         return os.fspath(picture)
@@ -54,9 +54,9 @@ def read_picture(picture: Any) -> str | AnyArray:
 
 @contextmanager
 def as_file(picture: str | AnyArray) -> Iterator[str]:
-    """Yield the path of a picture: its own, or that of a GeoTIFF of an array (H, W) or (H, W, bands) meanwhile.
+    """Yield the path of a picture: its own, or a GeoTIFF's that holds an array (H, W) or (H, W, bands) meanwhile.
 
-    Numbers between 0 and 1 become those of 8 bits; masked pixels are transparent.
+    Numbers between 0 and 1 become numbers of 8 bits; masked pixels are transparent.
     """
     if isinstance(picture, str):
         yield picture

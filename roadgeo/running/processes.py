@@ -113,7 +113,7 @@ def _require_guard() -> None:
 
 
 def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
-    # A fork server loads the libraries once for all; where there is none each process starts afresh.
+    # A fork server loads the libraries once for all; elsewhere each process starts afresh.
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
     if method == "forkserver":

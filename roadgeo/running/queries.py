@@ -79,7 +79,7 @@ class FirstLook:
     coarser : float
         Pixels of the query for each of the mask, along a side: above 1 for a large photograph, below for a coarse one.
     probability : ProbabilityMap or None
-        Of a photograph, in its own pixels (those of its mask, where it is large).
+        What segmenters see in a photograph, in its own pixels, or in its mask's where it is large.
     """
 
     mask: RoadMask

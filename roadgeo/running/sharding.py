@@ -54,7 +54,8 @@ __all__ = ["RoadFiles", "ShardOptions", "build_shards"]
 #: A shard of this many straight pieces of road has 30,000 to 80,000 intersections, and takes 0.4 to 1 GB to build.
 _SEGMENTS = 200_000
 
-#: Vertices of main roads that are drawn in one piece, as the coarse map, in up to 3 GB. Of more only the greater kinds.
+#: Vertices of main roads that are drawn in one piece, as the coarse map, in up to 3 GB. Beyond them only the greater
+#: kinds are drawn.
 _MOST_MAIN = 3_000_000
 _COARSE = "coarse"
 
@@ -195,9 +196,9 @@ def _spool(roads: RoadFiles, work: Path, options: ShardOptions, say: Say) -> _Sp
     """Stream the lines of all sources onto disk, unless that is done already."""
     path = work / "lines.json"
     if path.is_file():
-        told = json.loads(path.read_text(encoding="utf-8"))
-        counts = {(x, y): n for x, y, n in told.pop("n_segments")}
-        return _Spooled(**told, n_segments=counts)
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        counts = {(x, y): n for x, y, n in stored.pop("n_segments")}
+        return _Spooled(**stored, n_segments=counts)
     spooled = _stream(roads, work / "lines", options, None, say)
     if spooled is None:  # sources of different CRS
         spooled = _stream(roads, work / "lines", options, "EPSG:4326", say)
@@ -216,12 +217,12 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
     spool, sources = None, []
     area = None if roads.bbox is None else box_area(roads.bbox)
     for file in roads.files:
-        told: dict[str, Any] = {}
+        counts: dict[str, Any] = {}
         what = f"reading {file.name}"
         say(what)
         for part in stream_lines(file, roads.layer, advance=lambda share, what=what: say(what, share)):  # type: ignore[misc]
             chosen = choose_lines(with_crs(part, roads.crs, file), file.name, roads.which, roads.tunnels, area)
-            _add_up(told, chosen.meta)
+            _add_up(counts, chosen.meta)
             crs = crs or chosen.crs
             if spool is None:
                 spool = Spool(folder, _cell_size(str(crs), options))
@@ -229,9 +230,9 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
                 return None
             with writing(folder):
                 spool.add(_to(chosen, str(crs)), _labels(chosen))
-        tell_source(file.name, told)
-        sources.append(told)
-    calls = dict.fromkeys(one["attribution"] for one in sources if one.get("attribution"))
+        tell_source(file.name, counts)
+        sources.append(counts)
+    calls = dict.fromkeys(source["attribution"] for source in sources if source.get("attribution"))
     meta = {
         "roads": roads.which,
         "tunnels": roads.tunnels,
@@ -242,11 +243,11 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
     return None if spool is None else _Spooled(str(crs), spool.size, dict(spool.n_segments), meta)
 
 
-def _add_up(told: dict[str, Any], part: dict[str, Any]) -> None:
+def _add_up(counts: dict[str, Any], part: dict[str, Any]) -> None:
     """Add the counts of a part of a source to its totals."""
     for key, value in part.items():
         is_count = type(value) is int
-        told[key] = told.get(key, 0) + value if is_count else value
+        counts[key] = counts.get(key, 0) + value if is_count else value
 
 
 def _to(lines: RoadLines, crs: str) -> Any:
@@ -264,7 +265,7 @@ def _labels(lines: RoadLines) -> Any:
     columns = [as_text([column], [lines]) for column in (lines.name, lines.highway)]
     if all(column is None for column in columns):
         return None
-    return np.stack([np.full(len(lines.lines), "", object) if one is None else one for one in columns], axis=1)
+    return np.stack([np.full(len(lines.lines), "", object) if column is None else column for column in columns], axis=1)
 
 
 def _metres(crs: str) -> float | None:
@@ -287,7 +288,7 @@ def _coarse_box(boxes: Sequence[ShardBox]) -> ShardBox:
 def _main_roads(spool: Spool, ground: Bounds) -> tuple[Any, Any]:
     """Return main roads and their labels: the greatest kinds that are few enough to be drawn in one piece.
 
-    There are none where the ground (west, south, east, north, degrees) is so wide that no plane is true to scale.
+    No road is chosen where the ground (west, south, east, north, degrees) is so wide that no plane is true to scale.
     """
     import shapely
 
@@ -328,8 +329,8 @@ class ShardWork:
 
     def prepare(self) -> Callable[[ShardBox], ShardEntry | str]:
         """Return the builder of one shard, unless the shard exists."""
-        told = json.loads((Path(self.work) / "lines.json").read_text(encoding="utf-8"))
-        spool, crs = Spool(Path(self.work) / "lines", told["size"]), str(told["crs"])
+        stored = json.loads((Path(self.work) / "lines.json").read_text(encoding="utf-8"))
+        spool, crs = Spool(Path(self.work) / "lines", stored["size"]), str(stored["crs"])
         return lambda box: self._build(box, spool, crs)
 
     def give_up(self, task: ShardBox, reason: str) -> str:
@@ -350,7 +351,7 @@ class ShardWork:
         return entry
 
     def _build_reference(self, entry: ShardEntry, lines: RoadLines, box: ShardBox) -> ShardEntry:
-        """Build and write the reference of a shard; without three intersections there is none."""
+        """Build and write the reference of a shard; three intersections are needed."""
         from roadgeo.reference.files import reference_digest, reference_paths
         from roadgeo.reference.network_file import as_stored
 

@@ -44,7 +44,7 @@ class Variant:
     ----------
     mask : RoadMask
     matrix : (3, 3)
-        Affine map of the query's pixels to those of the variant.
+        Affine map from the query's pixels to the variant's.
     """
 
     mask: RoadMask

@@ -54,7 +54,7 @@ class Verified:
 
 @dataclass(frozen=True)
 class VerifyRun:
-    """How images are read and judged; `crs` is that of world files, or replaces the images' own."""
+    """How images are read and judged; `crs` belongs to world files, or replaces the images' own."""
 
     references: tuple[str, ...] = ()
     options: CheckOptions = field(default_factory=CheckOptions)
@@ -88,7 +88,7 @@ def verify_image(image: str, references: Sequence[AnyReference], settings: Verif
         place = read_georeference(image, settings.crs)
         if place is None:
             return Verified(_document(image, Checked("unknown", "it has no georeference: use `roadgeo locate`")))
-        pieces = [Reference(index) for one in references for index in one.indexes_at([place.middle()])]
+        pieces = [Reference(index) for reference in references for index in reference.indexes_at([place.middle()])]
         found = _best(_Image(image, place, settings), pieces)
         return replace(found, document={**found.document, "seconds": round(perf_counter() - started, 3)})
     except RoadgeoError as error:
@@ -104,11 +104,11 @@ class _Image:
 
 def _best(image: _Image, references: Sequence[Reference]) -> Verified:
     """Judge an image on the reference whose map shows most intersections in its frame."""
-    counted = [(_count_inside(image.place, one), k) for k, one in enumerate(references)]
+    counted = [(_count_inside(image.place, reference), k) for k, reference in enumerate(references)]
     most, k = max(counted, key=lambda pair: (pair[0], -pair[1]))
     reference = references[k]
     if most == 0:
-        names = ", ".join(dict.fromkeys(one.name for one in references))
+        names = ", ".join(dict.fromkeys(reference.name for reference in references))
         return Verified(
             _document(image.name, Checked("unknown", f"it lies on none of the maps ({names})"), image.place)
         )
@@ -172,7 +172,7 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     locate_query(image.name, [reference], replace(options, match=match, search=search), reading, how=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")
-    return next((one for one in results if one.verdict != "unknown"), results[0])
+    return next((checked for checked in results if checked.verdict != "unknown"), results[0])
 
 
 # --- telling ----------------------------------------------------------------------------------------------------------
@@ -219,8 +219,8 @@ def _document(
         plane = reference.index.plane
         known, rival = checked.displacement, checked.rival
         frame = None if known is None else _frame_of(place, reference)
-        document["displacement"] = None if known is None else _told(known, plane, frame, _inexact(place, reference))
-        document["rival"] = None if rival is None else _told(rival, plane, None)
+        document["displacement"] = None if known is None else _to_dict(known, plane, frame, _inexact(place, reference))
+        document["rival"] = None if rival is None else _to_dict(rival, plane, None)
     return document
 
 
@@ -229,7 +229,9 @@ def _frame_of(place: Georeference, reference: Reference) -> FloatArray:
     return Homography(place.on_plane(reference.index.plane)).facing(frame.center)(frame.corners)
 
 
-def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None, inexact: float = 0.0) -> dict[str, float]:
+def _to_dict(
+    found: Displacement, plane: LocalPlane, corners: FloatArray | None, inexact: float = 0.0
+) -> dict[str, float]:
     """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid.
 
     `inexact`: metres to which the image's CRS is taken to the plane's.
@@ -237,12 +239,12 @@ def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None, in
     turn = math.radians(grid_north(plane, plane.to_crs(found.about)))
     east = found.east_m * math.cos(turn) + found.north_m * math.sin(turn)
     north = found.north_m * math.cos(turn) - found.east_m * math.sin(turn)
-    told = {"east_m": east, "north_m": north, "turn_deg": found.turn_deg, "scale": found.scale}
+    values = {"east_m": east, "north_m": north, "turn_deg": found.turn_deg, "scale": found.scale}
     if corners is None:
-        return told
+        return values
     sigma = np.sqrt(np.diag(found.covariance))
     return {
-        **told,
+        **values,
         "sigma_east_m": math.hypot(float(sigma[0]), inexact / math.sqrt(2.0)),
         "sigma_north_m": math.hypot(float(sigma[1]), inexact / math.sqrt(2.0)),
         "sigma_turn_deg": math.degrees(float(sigma[2])),

@@ -122,7 +122,7 @@ def test_all_links_are_heeded_and_one_that_contradicts_the_others_is_not():
     assert worst(matrices) < 6.0
     chained = [np.eye(3)]
     for k in range(4):
-        chained.append(chained[-1] @ next(one.motion for one in good if (one.one, one.other) == (k, k + 1)))
+        chained.append(chained[-1] @ next(link.motion for link in good if (link.first, link.other) == (k, k + 1)))
     net = list(range(5))
     adjusted = adjust(chained, frame, good)
     assert worst(adjusted) < worst(chained)
