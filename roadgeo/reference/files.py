@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.reference.index_file import (
     FORMAT_VERSION,
-    check_index,
     dump_index,
     read_format_version,
     read_index,
@@ -27,7 +24,6 @@ from roadgeo.reference.index_file import (
     remedy,
 )
 from roadgeo.reference.network_file import (
-    computed_digest,
     dump_network,
     network_digest,
     read_meta,
@@ -38,14 +34,11 @@ from roadgeo.reference.network_file import (
 from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.files import publish, staging, sync_file
-from roadgeo.storage.geopackage import open_read_only, require_tables
 
 __all__ = [
     "Freshness",
     "IndexParts",
     "ReferencePaths",
-    "check_reference",
-    "describe_reference",
     "identities",
     "open_reference",
     "rebuild_index",
@@ -234,62 +227,6 @@ def reference_digest(path: str | os.PathLike[str]) -> str:
     return str(read_manifest(index)["about"].get("network", "")) if index.is_file() else ""
 
 
-def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Describe a reference in plain values; nothing is unpickled.
-
-    Returns
-    -------
-    dict
-        `name`, `freshness`, `files` (sizes in bytes by path), `crs`, `counts`, `meta` (the network's own); with an
-        index also its `format`, `roadgeo` (the version that built it), `memory_bytes` (of the mapped arrays), `extent`
-        (min easting, min northing, max easting, max northing), `road_km`, `area_km2`, `intersections_per_km2`,
-        `tuple_types` (the paper's Figure 7) and `index` (its options and grid).
-
-    Raises
-    ------
-    IndexFormatError
-        As `reference_freshness`.
-    """
-    paths = reference_paths(path)
-    freshness = reference_freshness(path)
-    files = [file for file in (paths.geopackage, paths.index) if file.is_file()]
-    description: dict[str, Any] = {
-        "name": paths.geopackage.stem,
-        "freshness": freshness,
-        "files": {str(file): file.stat().st_size for file in files},
-    }
-    if freshness in {"no index", "old format"}:
-        stored = read_meta(paths.geopackage)
-        own = {key: value for key, value in stored.items() if not key.startswith("roadgeo.")}
-        return description | {"crs": stored.get("roadgeo.crs"), "counts": _row_counts(paths.geopackage), "meta": own}
-    manifest = read_manifest(paths.index)
-    memory = sum(math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize for entry in manifest["arrays"])
-    written = {"format": manifest["format"], "roadgeo": manifest["roadgeo"], "memory_bytes": memory}
-    about = {key: value for key, value in manifest["about"].items() if key not in {"name", "network"}}
-    return description | {"name": manifest["about"].get("name") or description["name"]} | written | about
-
-
-def check_reference(path: str | os.PathLike[str]) -> list[str]:
-    """Verify a reference thoroughly: all digests, all ranges, and that both files agree.
-
-    Returns
-    -------
-    list of str
-        Problems, one sentence each; empty when the reference is sound.
-    """
-    paths = reference_paths(path)
-    if not paths.geopackage.is_file() and not paths.index.is_file():
-        return [f"no reference {path}: expected {paths.geopackage}"]
-    network, problems = None, []
-    if paths.geopackage.is_file():
-        network, found = _check_geopackage(paths.geopackage)
-        problems += found
-    if paths.index.is_file():
-        found = check_index(paths.index)
-        problems += found or _check_content(paths.index, network)
-    return problems
-
-
 # --- building ---------------------------------------------------------------------------------------------------------
 
 
@@ -357,70 +294,3 @@ def _count_tuple_types(found: Intersections, d_max: float) -> dict[str, Any]:
             if pairs:
                 counts.append({"d_b": [b1, b2, q1, q2], "tuples": pairs})
     return {"d_max_m": d_max, "types": sorted(counts, key=lambda entry: -entry["tuples"])}
-
-
-def _row_counts(path: Path) -> dict[str, int]:
-    layers = ("intersections", "roads")
-    with open_read_only(path) as database:
-        require_tables(database, path, *layers)
-        # A sum goes through the rows, within the work that is allowed; count(*) follows a forged tree without end.
-        sums = {layer: database.execute(f"SELECT sum(1) FROM {layer}").fetchone() for layer in layers}  # noqa: S608
-    return {layer: int(n or 0) for layer, (n,) in sums.items()}
-
-
-# --- checking ---------------------------------------------------------------------------------------------------------
-
-
-def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
-    """Read all of a GeoPackage; return the network, if it is one, and the fault, if there is one."""
-    try:
-        with open_read_only(path) as database:
-            notes = [note for (note,) in database.execute("PRAGMA integrity_check")]
-            orphans = database.execute("PRAGMA foreign_key_check").fetchall()
-        network = read_network(path)
-        digest = computed_digest(path)
-        stale = stored_digest(path) != digest
-    except IndexFormatError as error:
-        return None, [str(error)]
-    problems = [f"{path}: SQLite finds: {note}" for note in notes if note != "ok"]
-    if orphans:
-        problems.append(f"{path}: {len(orphans)} rows refer to tables or metadata that do not exist")
-    if stale:
-        problems.append(f"{path}: its intersections differ from their stored digest")
-    return network, problems
-
-
-def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
-    """Check that the search can use an undamaged index, and compare it with its GeoPackage."""
-    from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index, check_table
-
-    def are_options(stored: Any) -> bool:
-        """Whether stored options are whole, and no larger than the arrays that they made."""
-        return (
-            type(stored) is dict
-            and stored.keys() == {field.name for field in fields(IndexOptions)}
-            and all(type(value) in (int, float) and math.isfinite(value) for value in stored.values())
-            and stored["n_neighbours"] == index.neighbours.shape[1]
-        )
-
-    manifest = read_manifest(path)
-    try:
-        index = ReferenceIndex.from_parts(*read_index(path), path=str(path))
-        check_table(index)
-    except IndexFormatError as error:
-        return [str(error)]
-    if network is None:
-        return []
-    if manifest["about"].get("network") != network_digest(network):
-        return [f"{path} is stale: it was built from other intersections; {remedy(path)}"]
-    if manifest["roadgeo"] != __version__:  # which may well have built another index
-        return []
-    stored: Any = index.meta.get("index_options")
-    if not are_options(stored):
-        return [f"{path}: its options are none that `roadgeo index` writes; {remedy(path)}"]
-    expected = build_index(network, IndexOptions(**stored)).arrays()
-    return [
-        f"{path}: its array {name!r} is not what the GeoPackage gives; {remedy(path)}"
-        for name, array in index.arrays().items()
-        if not np.array_equal(array, expected[name], equal_nan=array.dtype.kind == "f")
-    ]

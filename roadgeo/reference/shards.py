@@ -20,20 +20,18 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from roadgeo import __version__
-from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.areas import Box, overlap
 from roadgeo.location import Location
 from roadgeo.matching.index import COARSENESS, ReferenceIndex
 from roadgeo.matching.parts import Near, touches
-from roadgeo.reference.files import check_reference, identities, reference_digest, reference_paths
+from roadgeo.reference.files import identities, reference_digest, reference_paths
 from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
@@ -45,12 +43,10 @@ __all__ = [
     "Shard",
     "ShardEntry",
     "ShardedReference",
-    "check_shards",
-    "describe_shards",
     "manifest_path",
     "open_shards",
     "read_manifest",
-    "shards_digest",
+    "shard_path",
     "write_manifest",
 ]
 
@@ -344,15 +340,16 @@ def open_shards(path: Path) -> ShardedReference:
         The manifest is damaged.
     """
     manifest = read_manifest(path)
-    shards = tuple(Shard(entry, _shard_path(path, manifest, entry)) for entry in manifest.filled)
+    shards = tuple(Shard(entry, shard_path(path, manifest, entry)) for entry in manifest.filled)
     coarse = None
     if manifest.coarse is not None and manifest.coarse.crs:
-        coarse = Shard(manifest.coarse, _shard_path(path, manifest, manifest.coarse), COARSENESS)
+        coarse = Shard(manifest.coarse, shard_path(path, manifest, manifest.coarse), COARSENESS)
     _allow_open_files(2 * len(shards))
     return ShardedReference(path.parent, manifest, shards, coarse)
 
 
-def _shard_path(path: Path, manifest: Manifest, entry: ShardEntry) -> Path:
+def shard_path(path: Path, manifest: Manifest, entry: ShardEntry) -> Path:
+    """Return the GeoPackage of a shard beside the manifest at `path`."""
     return path.parent / manifest.build / f"{entry.name}.gpkg"
 
 
@@ -365,69 +362,3 @@ def _allow_open_files(more: int) -> None:
         wanted = min(more + 1024, hard) if hard != resource.RLIM_INFINITY else more + 1024
         if wanted > soft != resource.RLIM_INFINITY:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-# --- describing and checking ------------------------------------------------------------------------------------------
-
-
-def shards_digest(path: Path) -> str:
-    """Return a digest of the intersections of all shards.
-
-    Raises
-    ------
-    IndexFormatError
-        The manifest is damaged.
-    """
-    digests = "".join(entry.digest for entry in read_manifest(path).files)
-    return blake2b(digests.encode(), digest_size=16).hexdigest()
-
-
-def describe_shards(path: Path) -> dict[str, Any]:
-    """Describe a sharded reference in plain values, as `files.describe_reference` does; no shard is opened.
-
-    Raises
-    ------
-    IndexFormatError
-        The manifest is damaged.
-    """
-    manifest = read_manifest(path)
-    shards, filled = manifest.shards, manifest.filled
-    missing = [
-        entry for entry in manifest.files if not reference_paths(_shard_path(path, manifest, entry)).index.is_file()
-    ]
-    west, south, east, north = zip(*(entry.reach for entry in filled), strict=True)
-    return {
-        "name": manifest.name,
-        "freshness": "shards missing" if missing else "fresh",
-        "files": {str(path.parent): path.stat().st_size + sum(entry.bytes for entry in manifest.files)},
-        "crs": ", ".join(dict.fromkeys(entry.crs for entry in filled)),
-        "counts": {"intersections": sum(entry.own_intersections for entry in filled)},
-        "meta": manifest.meta,
-        "roadgeo": manifest.roadgeo,
-        "extent_lonlat": [min(west), min(south), max(east), max(north)],
-        "shards": {
-            "count": len(filled),
-            "without_roads": len(shards) - len(filled),
-            "margin_m": manifest.margin_m,
-            "largest": max(entry.intersections for entry in filled),
-            "with_margins": sum(entry.intersections for entry in filled),
-            "coarse": 0 if manifest.coarse is None else manifest.coarse.intersections,
-        },
-    }
-
-
-def check_shards(path: Path, say: Say = say_nothing) -> list[str]:
-    """Verify all shards thoroughly, and that they are those that the manifest names; return the problems."""
-    try:
-        manifest = read_manifest(path)
-    except IndexFormatError as error:
-        return [str(error)]
-    problems: list[str] = []
-    for n, entry in enumerate(manifest.files):
-        say(f"checking {len(manifest.files)} shards", n / len(manifest.files))
-        shard = _shard_path(path, manifest, entry)
-        found: Sequence[str] = check_reference(shard)
-        if not found and reference_digest(shard) != entry.digest:
-            found = [f"{shard}: is not the shard that the manifest names; build the reference again"]
-        problems += found
-    return problems

@@ -20,8 +20,6 @@ from worlds.networks import grid_network
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.reference import plain_values
 from roadgeo.reference.files import (
-    check_reference,
-    describe_reference,
     open_reference,
     rebuild_index,
     reference_freshness,
@@ -29,6 +27,7 @@ from roadgeo.reference.files import (
     write_reference,
 )
 from roadgeo.reference.index_file import FORMAT_VERSION, read_manifest
+from roadgeo.reference.inspection import check_reference, describe_reference
 from roadgeo.reference.network_file import as_stored, network_digest, read_network, write_network
 from roadgeo.roads.network import RoadNetwork
 
@@ -476,7 +475,7 @@ def test_options_that_nobody_wrote_are_found(
     stored = meta["index_options"] | options if options else options
     paths = write_reference(tmp_path / "grid", network, (meta | {"index_options": stored}, arrays))
     (problem,) = check_reference(paths.geopackage)
-    assert "its options are none that" in problem
+    assert "its options are not those of its GeoPackage" in problem
 
 
 def test_a_stale_index_and_an_unnoticed_edit_are_found(checked: Path) -> None:
@@ -492,3 +491,27 @@ def test_a_stale_index_and_an_unnoticed_edit_are_found(checked: Path) -> None:
     problems = check_reference(checked)
     assert any("differ from their stored digest" in problem for problem in problems)
     assert any("stale" in problem for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("options", '{"index": {"n_neighbours": 99}}', "index.n_neighbours is 99"),
+        ("roadgeo.crs", '"EPSG:1"', "EPSG:1"),
+        (None, "", "at least 3 are needed"),
+    ],
+)
+@pytest.mark.parametrize("index_too", [False, True])
+def test_what_cannot_be_searched_is_not_sound(
+    checked: Path, key: str | None, value: str, message: str, index_too: bool
+) -> None:
+    """A check passed over what `locate` stumbled on."""
+    with editing(checked) as database:
+        if key is None:
+            database.execute("DELETE FROM intersections WHERE fid > 2")
+        else:
+            database.execute("INSERT OR REPLACE INTO roadgeo_meta (key, value) VALUES (?, ?)", (key, value))
+    if not index_too:
+        checked.with_suffix(".index").unlink()
+    problems = check_reference(checked)
+    assert any(message in problem and str(checked) in problem for problem in problems), problems

@@ -15,7 +15,7 @@ from worlds.networks import grid_network, same_values
 
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.reference.files import check_reference, describe_reference
+from roadgeo.reference.inspection import check_reference, describe_reference
 from roadgeo.reference.network_file import (
     as_stored,
     computed_digest,

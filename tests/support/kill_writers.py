@@ -25,7 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a program, this fil
 
 from worlds.networks import grid_network
 
-from roadgeo.reference.files import check_reference, open_reference, write_reference
+from roadgeo.reference.files import open_reference, write_reference
+from roadgeo.reference.inspection import check_reference
 from roadgeo.reference.network_file import as_stored, network_digest, read_network
 from roadgeo.roads.network import RoadNetwork
 

@@ -30,8 +30,9 @@ from roadgeo.flights.motion import read_motion
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
 from roadgeo.matching.hints import HINTS
 from roadgeo.reference.index_file import read_index
+from roadgeo.reference.inspection import _describe_shards
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.shards import describe_shards, open_shards
+from roadgeo.reference.shards import open_shards
 from roadgeo.running.applying import apply_location, read_location
 from roadgeo.serving.requests import ending_of, read_query_string
 from roadgeo.sources.elevation import ground_heights
@@ -176,7 +177,7 @@ def read_truth_beside(path: Path) -> None:
 
 def read_shards(path: Path) -> None:
     open_shards(path)
-    describe_shards(path)
+    _describe_shards(path)
 
 
 def apply(path: Path) -> None:
