@@ -8,17 +8,17 @@ __all__ = ["counted", "visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-#: Sequences that `click.style` writes, and line ends.
-_OURS = re.compile("(\x1b\\[(?:0|1|3[1-7])m|[\n\t])")
 
 
-def visible(text: str, *, ours: bool = False) -> str:
+def visible(text: str, *, lines: bool = False) -> str:
     r"""Write characters that a terminal obeys instead of showing them as escapes: "\x1b".
 
-    Line ends and tabs become spaces, unless the text is `ours`: then they stay, and so do colours.
+    Line ends and tabs become spaces, unless `lines` are to stay.
     """
-    if ours:
-        return "".join(part if i % 2 else _UNSEEN.sub(_escape, part) for i, part in enumerate(_OURS.split(text)))
+    if lines:
+        return "".join(
+            part if part in ("\n", "\t") else _UNSEEN.sub(_escape, part) for part in re.split("([\n\t])", text)
+        )
     return _UNSEEN.sub(_escape, re.sub("[\r\n\t]+", " ", text))
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import click
 
 from roadgeo import __version__
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, paint
 from roadgeo.errors import RoadgeoError, name_package
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
@@ -196,6 +196,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    error = click.style("Error:", fg="red") + " " + " ".join(message.split())
+    error = paint("Error:", "red") + " " + " ".join(message.split())
     echo(error, err=True, color=False if os.environ.get("NO_COLOR") else None)
     return status

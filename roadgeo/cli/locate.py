@@ -34,7 +34,7 @@ from roadgeo.cli.options import (
     row,
     take,
 )
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, paint
 from roadgeo.cli.truths import read_truths
 from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import (
@@ -308,11 +308,11 @@ def describe(outcome: Outcome) -> str:
     found = outcome.document
     words = outcome.status.replace("_", " ")
     if outcome.status == "error":
-        return f"{click.style('Error:', fg='red')} {visible(found['reason'])}"
+        return f"{paint('Error:', 'red')} {visible(found['reason'])}"
     query = visible(found["query"])
     if outcome.earlier:
         return f"{query}: {words} before"
-    status = click.style(words, fg="green" if outcome.status == "located" else "yellow")
+    status = paint(words, "green" if outcome.status == "located" else "yellow")
     if outcome.status != "located" or found["center"] is None:
         text = f"{query}: {status}: {visible(found['reason'])}"
     else:
@@ -342,7 +342,7 @@ def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single:
     if as_json:
         echo(json.dumps(outcome.document))
     for fault in outcome.faults:
-        echo(f"{click.style('Error:', fg='red')} {visible(fault)}", err=True)
+        echo(f"{paint('Error:', 'red')} {visible(fault)}", err=True)
     if outcome.status == "error":
         echo(describe(outcome), err=True)
         return

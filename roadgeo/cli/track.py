@@ -29,7 +29,7 @@ from roadgeo.cli.options import (
     row,
     take,
 )
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, paint
 
 if TYPE_CHECKING:
     from roadgeo.flights.frames import FrameOptions
@@ -281,7 +281,7 @@ def _print(row: Row, as_json: bool, quiet: bool, verbose: bool) -> None:
     elif not quiet:
         from roadgeo.outputs.wording import format_lonlat
 
-        status = click.style(row.status, fg=_SHOWN[row.status])
+        status = paint(row.status, _SHOWN[row.status])
         where = "" if row.center is None else f" at {format_lonlat(*row.center)}, sigma {row.sigma_m:.1f} m"
         why = f": {row.reason}" if verbose or row.status in ("lost", "predicted") else ""
         echo(f"{row.name}: {status}{where}{why}")

@@ -15,7 +15,7 @@ from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import IMAGE, OTHERS, RESULTS, Command, each, out_dir_option, read_options, row, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, paint, plain
 
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference
@@ -148,7 +148,7 @@ def _write_page(
     place = None if verified.verdict == "error" else read_georeference(image, settings.crs)
     indexes = [] if place is None else [index for each in opened for index in each.indexes_at([place.middle()])]
     index = next((index for index in indexes if index.name == verified.document.get("reference")), None)
-    said = click.unstyle(describe(verified.document)).removeprefix(f"{image}: {verified.verdict}: ")
+    said = plain(describe(verified.document)).removeprefix(f"{image}: {verified.verdict}: ")
     write_verification(page, verified.document, said, place, verified.corrected, index)
     return page
 
@@ -174,7 +174,7 @@ def _correct(verified: Verified, image: Path, stem: Path, fix: bool, in_place: b
 def describe(document: dict[str, Any]) -> str:
     """Print the result of an image, in a line."""
     verdict, found = document["verdict"], document.get("displacement")
-    word = click.style(verdict, fg=_COLORS.get(verdict))
+    word = paint(verdict, _COLORS.get(verdict))
     if verdict == "off" and found is not None:
         return (
             f"{document['image']}: {word}: move it {found['east_m']:+.1f} m east, {found['north_m']:+.1f} m north"
@@ -188,7 +188,7 @@ def _report(verified: Verified, files: list[Path], as_json: bool, quiet: bool, v
     if as_json:
         echo(json.dumps({**verified.document, **made_by()}))
     if verified.verdict == "error":
-        echo(f"{click.style('Error:', fg='red')} {' '.join(verified.document['reason'].split())}", err=True)
+        echo(f"{paint('Error:', 'red')} {' '.join(verified.document['reason'].split())}", err=True)
     elif not quiet:
         echo(describe(verified.document), err=as_json)
         if verbose and verified.document.get("log10_lead") is not None:

@@ -12,7 +12,7 @@ from worlds.fenway import write_streets
 
 from roadgeo._text import visible
 from roadgeo.cli import main
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, paint, plain
 from roadgeo.errors import MaskError
 from roadgeo.running.tasks import name_tasks
 
@@ -28,9 +28,12 @@ def test_what_a_terminal_obeys_is_shown_instead() -> None:
     assert str(MaskError(f"{ESCAPES}\n: no such file")) == f"{visible(ESCAPES)} : no such file"
 
 
-def test_our_own_colours_and_lines_stay(capsys: pytest.CaptureFixture[str]) -> None:
-    echo("\x1b[31mError:\x1b[0m one\n  two \x1b[8m hidden", color=True)
-    assert capsys.readouterr().out == "\x1b[31mError:\x1b[0m one\n  two \\x1b[8m hidden\n"
+def test_our_own_colours_and_lines_stay_and_no_others(capsys: pytest.CaptureFixture[str]) -> None:
+    """Colours in names were obeyed."""
+    text = f"{paint('Error:', 'red')} one\n  \x1b[31mtwo \x1b[8m hidden"
+    echo(text, color=True)
+    assert capsys.readouterr().out == "\x1b[31mError:\x1b[0m one\n  \\x1b[31mtwo \\x1b[8m hidden\n"
+    assert plain(text) == "Error: one\n  \x1b[31mtwo \x1b[8m hidden"
 
 
 @pytest.mark.parametrize("name", [f"[bold]{ESCAPES}.png", os.fsdecode(b"caf\xe9\n.png")])
