@@ -52,4 +52,4 @@ def _say(option: click.Option, value: Any) -> list[str]:
     if option.is_flag:
         return [option.opts[-1] if value else option.secondary_opts[-1]]
     values: Sequence[str] = value if option.multiple else [value]
-    return [f"{option.opts[-1]}={one}" for one in values]
+    return [f"{option.opts[-1]}={each}" for each in values]

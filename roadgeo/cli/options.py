@@ -76,11 +76,11 @@ class _Option(click.Option):
         record = super().get_help_record(ctx)
         if record is None:
             return None
-        names, told = record
+        names, text = record
         if getattr(ctx.command, "is_long", False) and not ctx.meta.get(_WHOLE, False):
-            default = re.search(r"\[default: [^\];]*", told)
-            told = re.split(r"(?<=[^.]\.) ", self.help or "")[0] + (f"  {default[0]}]" if default else "")
-        return names.replace(f", {self.hint.also}", "") if self.hint and self.hint.also else names, told
+            default = re.search(r"\[default: [^\];]*", text)
+            text = re.split(r"(?<=[^.]\.) ", self.help or "")[0] + (f"  {default[0]}]" if default else "")
+        return names.replace(f", {self.hint.also}", "") if self.hint and self.hint.also else names, text
 
 
 class Command(click.Command):
@@ -93,12 +93,12 @@ class Command(click.Command):
         super().__init__(*args, **settings)
         self.more = more
         self.is_long = (
-            bool(more) or "\f" in (self.help or "") or any(getattr(one, "rare", False) for one in self.params)
+            bool(more) or "\f" in (self.help or "") or any(getattr(param, "rare", False) for param in self.params)
         )
         if self.is_long:
-            told = "Show this message with all options."
+            text = "Show this message with all options."
             self.params.append(
-                _Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=told)
+                _Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=text)
             )
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -123,7 +123,7 @@ class Command(click.Command):
                 groups.setdefault(group, [])
             else:
                 groups.setdefault(group, []).append(record)
-        groups[OTHERS] = groups.pop(OTHERS, [])  # those of all commands come last
+        groups[OTHERS] = groups.pop(OTHERS, [])  # the options of all commands come last
         for group, records in groups.items():
             with formatter.section(group):
                 if records:
@@ -145,7 +145,7 @@ def _show_all(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
         ctx.exit()
 
 
-def row(names: str, shown: str | tuple[str, ...] | None, group: str, told: str, **more: Any) -> Callable[..., Any]:
+def row(names: str, shown: str | tuple[str, ...] | None, group: str, text: str, **more: Any) -> Callable[..., Any]:
     """Make an option from a row of a table. It decorates a command; keywords given with the command replace its own.
 
     Parameters
@@ -156,13 +156,13 @@ def row(names: str, shown: str | tuple[str, ...] | None, group: str, told: str, 
         What stands for its value (None: its type), or the words among which one chooses; "" for a switch.
     group : str
         Under which heading of the help it stands.
-    told : str
+    text : str
         Its help; what stands behind the first sentence is shown by --help-all only.
     **more
         As for `click.option`; `rare`.
     """
     kind: dict[str, Any] = {"type": click.Choice(shown)} if isinstance(shown, tuple) else {"metavar": shown}
-    settings = {**({"is_flag": True} if shown == "" else kind), "group": group, "help": told, **more}
+    settings = {**({"is_flag": True} if shown == "" else kind), "group": group, "help": text, **more}
 
     def add(command: Decorated, **own: Any) -> Decorated:
         return click.option(*names.split(), cls=_Option, **(settings | own))(command)
@@ -174,7 +174,7 @@ def each(decorators: Iterable[Callable[[Decorated], Decorated]]) -> Callable[[De
     """Put options upon a command, in their order."""
 
     def add(command: Decorated) -> Decorated:
-        return reduce(lambda decorated, one: one(decorated), reversed([*decorators]), command)
+        return reduce(lambda decorated, add: add(decorated), reversed([*decorators]), command)
 
     return add
 
@@ -253,7 +253,7 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         name, colon, _ = text.partition(":")
         known = self._known()
         if name not in known or bool(colon) != self.has_argument:
-            expected = ", ".join(f"{one}:WHERE" if self.has_argument else one for one in known)
+            expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in known)
             self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
         return text
 
@@ -336,13 +336,13 @@ _SHARED = {
         "or STAC describe them. Several are fused. Default: the model that ships.",
         type=Plugin("roadgeo.segmenters", file_ending=".onnx"), multiple=True, rare=True),
     "class_name": row("--class class_name", "NAME", IMAGE,
-        "Class of the model that is road. Default: told by the names.", rare=True),
+        "Class of the model that is road. Default: by the names.", rare=True),
     "fuse": row("--fuse", "", IMAGE,
         "All images show one frame (exposures, masks of several models): fuse them.", rare=True),
     "threshold": row("--threshold", "T", IMAGE,
-        "Values above T are road; of photographs, probabilities. Default: told by the values.", type=float, rare=True),
+        "Values above T are road; of photographs, probabilities. Default: by the values.", type=float, rare=True),
     "band": row("--band", "N", IMAGE,
-        "Band that holds the mask. Default: told by the bands.", type=click.IntRange(1), rare=True),
+        "Band that holds the mask. Default: by the bands.", type=click.IntRange(1), rare=True),
     "bands": row("--bands", "R,G,B", IMAGE,
         "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
         type=Read("bands", _read_bands), rare=True),
@@ -373,7 +373,7 @@ def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
     """Add options of the tables by their names; `settings` replace the tables' settings of a single one."""
 
     def add_all(command: Decorated) -> Decorated:
-        for name in reversed([one for given in names for one in _TOGETHER.get(given, (given,))]):
+        for name in reversed([option for given in names for option in _TOGETHER.get(given, (given,))]):
             add = partial(_hint_option, name) if name in HINTS else _SHARED[name]
             command = add(command, **settings)
         return command
@@ -399,7 +399,7 @@ def out_dir_option(
 
 
 def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hints on the image, of all parameters; a switch that was not set is none."""
+    """Return the hints on the image, out of all parameters; a switch that was not set is left out."""
     names = (hint.goes_to for hint in HINTS.values())
     return {name: given[name] for name in names if given.get(name) is not None and given[name] is not False}
 
@@ -419,7 +419,7 @@ def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOption
     if method == "pair":
         idle = [hint for hint in HINTS.values() if hint.group != SEARCH and known.get(hint.goes_to, False) is not False]
         if idle:
-            raise click.UsageError(f"--method pair takes no {', '.join(one.option for one in idle)}: leave it out.")
+            raise click.UsageError(f"--method pair takes no {', '.join(hint.option for hint in idle)}: leave it out.")
     return apply_hints(replace(LocateOptions(), method=method), known)
 
 

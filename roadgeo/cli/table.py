@@ -21,13 +21,13 @@ def describe_options(commands: Sequence[str]) -> dict[str, dict[str, dict[str, A
     Returns
     -------
     dict
-        Of each option `help`; `schema`, the JSON Schema of a value; `default`, "" where there is none; whether it
+        For each option: `help`; `schema`, the JSON Schema of a value; `default`, "" without one; whether it
         `is_hint` on the image, and then its `label`.
     """
     context = click.Context(cli)
     found = {name: cli.get_command(context, name) for name in commands}
     return {
-        name: {_name(one): _describe(one) for one in command.params if isinstance(one, click.Option)}
+        name: {_name(param): _describe(param) for param in command.params if isinstance(param, click.Option)}
         for name, command in found.items()
         if command is not None
     }
@@ -40,11 +40,11 @@ def _name(option: click.Option) -> str:
 def _describe(option: click.Option) -> dict[str, Any]:
     hint: Hint | None = getattr(option, "hint", None)
     if hint is not None:
-        told = {"label": hint.label, "schema": dict(hint.schema), "default": hint.default}
+        described = {"label": hint.label, "schema": dict(hint.schema), "default": hint.default}
     else:
         default = option.default if isinstance(option.default, str | int | float) and not option.is_flag else ""
-        told = {"label": "", "schema": _schema(option), "default": default}
-    return {**told, "help": option.help or "", "is_hint": hint is not None}
+        described = {"label": "", "schema": _schema(option), "default": default}
+    return {**described, "help": option.help or "", "is_hint": hint is not None}
 
 
 def _schema(option: click.Option) -> dict[str, Any]:
