@@ -393,7 +393,7 @@ def verify(
     max_turn : float
         By how much it may be turned, degrees.
     crs : str
-        Of world files, which name none.
+        CRS of world files, which name no CRS.
 
     Returns
     -------
@@ -460,7 +460,7 @@ def track(
     Raises
     ------
     MaskError
-        A frame cannot be read; there is none.
+        A frame cannot be read, or there are no frames.
     IndexFormatError
         A reference is missing or unusable.
     """

@@ -1,4 +1,4 @@
-"""The answer: where a mask lies on the map, how sure that is, or why there is none (schema `roadgeo.location/1`)."""
+"""The answer: where a mask lies on the map, how sure that is, or why it has no place (schema `roadgeo.location/1`)."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Reason(StrEnum):
     #: A segmenter or another plugin failed.
     PLUGIN = "plugin"
     MEMORY = "memory"
-    #: Of roadgeo itself.
+    #: The fault is roadgeo's own.
     FAULT = "fault"
 
 
@@ -151,14 +151,14 @@ class Camera:
     height_m : float
         Above the ground in the frame, taken for level.
     heading_deg, pitch_deg, roll_deg : float
-        Of an aircraft that looks straight down from its belly, its nose at the image's top: heading clockwise from true
-        north, pitch positive with the nose up, roll with the right wing down.
+        Angles of an aircraft that looks straight down from its belly, its nose at the image's top: heading clockwise
+        from true north, pitch positive with the nose up, roll with the right wing down.
     focal_px, focal_sigma_px : float
         Focal length in pixels of the mask, and its standard deviation: 0 where it was given.
     source : str
         Origin of the focal length, as in `Location.tilt_source`.
     covariance : (6, 6) float64
-        Of x, y and height, metres, and of the three angles, degrees.
+        Covariance of x, y and height, metres, and of the three angles, degrees.
     rotation : (3, 3) float64
         Axes of the camera (x right, y to the image's top, z backwards) to east, north and up.
     ground_m, ground_spread_m : float or None
@@ -230,7 +230,7 @@ class Seconds:
 class Stats:
     """Work done by the search: counts, and the time they would take one core of a usual machine, in milliseconds.
 
-    Of a larger map more is allowed, and counts as less (see `matching.search.SearchOptions`).
+    On a larger map more is allowed, and counts as less (see `matching.search.SearchOptions`).
     """
 
     tuples_sampled: int = 0
@@ -293,11 +293,11 @@ class Location:
         one datum, NaN where it does not know.
     lens_k1 : float
         Radial distortion by the lens (see `geometry.lens`), estimated where the mask shows one, else 0. The
-        homography, footprint and corners are those of the frame as a pinhole would have seen it.
+        homography, footprint and corners describe the frame as a pinhole would have seen it.
     rotation_deg : float
         Direction of the image's up at its centre, clockwise from true north.
     tilt_deg : float or None
-        Of the camera from the vertical.
+        Angle of the camera's axis from the vertical.
     tilt_source : str or None
         Origin of the focal length: the given "camera", the "homography" where that determines it, or a usual lens
         that is "assumed".
@@ -319,7 +319,7 @@ class Location:
     options : dict or None
         Options that differ from the defaults, in plain values; None: not recorded.
     query_to_pixel : (3, 3) float64 or None
-        Of roads that came as lines: their coordinates to pixels of the mask that was drawn of them.
+        For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
     mirrored : bool
         The mask has this place turned over only, left to right: the homography mirrors.
     stated_offset_m : float or None
@@ -327,7 +327,7 @@ class Location:
     command : str
         The command line that makes this result again; "" where another program asked.
     reference_digest : str
-        Of the roads of the reference; "" where it has no file.
+        Digest of the roads of the reference; "" where it has no file.
     """
 
     query: str

@@ -50,7 +50,7 @@ def load_plugin(group: str, name: str) -> Any:
     Raises
     ------
     PluginError
-        There is none of that name, or it cannot be imported.
+        No plugin has that name, or it cannot be imported.
     """
     found = find_plugins(group)
     if name not in found:

@@ -59,7 +59,7 @@ What is known goes into the URL or the form, in the words of `roadgeo locate`:
 Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The
 size of images, the time to send and to search are bounded too. Ctrl-C ends it.
 
-With --mavlink each place that is found goes to an autopilot, too: that of the camera where the request gives its focal
+With --mavlink each place that is found goes to an autopilot, too: the camera's where the request gives its focal
 length, otherwise the frame's middle (it needs pymavlink).
 """
 
@@ -77,7 +77,7 @@ def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str
     Raises
     ------
     click.BadParameter
-        It is none.
+        It is no such address.
     """
     if url is None:
         return ""

@@ -29,7 +29,7 @@ class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
         Raises
         ------
         click.BadParameter
-            It is none of these.
+            It is something else.
         """
         if isinstance(value, dict):
             return value

@@ -22,7 +22,7 @@ def find_area(text: str) -> Box:
     Raises
     ------
     ValueError
-        There is none of that name, or there are several.
+        No area or several areas have that name.
     """
     words = " " in text.strip() and any(sign.isalpha() for sign in text)  # as "Germany - onshore east of 12°E" has
     if any(sign.isdigit() for sign in text) and not words:

@@ -18,7 +18,7 @@ __all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampl
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
 #: A frame that covers less ground than this, square metres, has shrunk to a point, whatever camera is allowed.
 _LEAST_AREA = 1e-6
-#: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
+#: Focal length that is taken where none fits better: in halves of the frame's diagonal, as a usual lens has it.
 _USUAL_FOCAL = 1.5
 #: How much more skew a usual focal length may leave than one e times as long.
 _FOCAL_PRIOR = 0.01
@@ -52,7 +52,7 @@ class CameraOptions:
     focal_px : float or None
         Focal length, where it is known.
     max_skew : float
-        How far the homography may be from that of any pinhole with square pixels whose axis meets the middle of the
+        How far the homography may be from one of a pinhole with square pixels whose axis meets the middle of the
         frame: the greater of the absolute cosine of the angle between the images of two perpendicular unit vectors and
         the logarithm of the ratio of their lengths. A crop or lens distortion moves it from 0.
     north_up : bool
@@ -107,7 +107,7 @@ class CameraPose:
     rotation_deg : float
         Direction of the image's up there, clockwise from north.
     tilt_deg, focal_px : float
-        Of the pinhole that fits best: the angle of its axis from the vertical. Ill determined near the nadir.
+        Angle from the vertical of the axis of the pinhole that fits best. Ill determined near the nadir.
     source : str
         Origin of the focal length: the given "camera", the "homography", or a usual lens "assumed" where the homography
         fits too wide a range of focal lengths about as well.
@@ -166,7 +166,7 @@ def _pinholes(matrix: FloatArray, size: tuple[int, int], focal_px: float | None)
 def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
     """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
 
-    The focal length is that of the pinhole that fits best, and of a usual lens where all fit alike, as near the nadir.
+    The focal length belongs to the pinhole that fits best, or to a usual lens where all fit alike, as near the nadir.
     """
     jacobian = Homography(matrix).jacobian(Frame(*size).plane_center)
     gsd = sampling(matrix, size)
@@ -186,8 +186,8 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     """Return why a homography is not plausible, or None if it is.
 
     Some camera within the options must fit about as well as any. A `rough` homography, of a few matches or of a part of
-    the frame, may still become plausible: its bounds are wider, and it may be skewed. Of 16 steep views that were lost,
-    two were refused for that and fit once refined.
+    the frame, may still become plausible: its bounds are wider, and it may be skewed. Two of 16
+    lost steep views were refused for that and fit once refined.
     """
     if not np.isfinite(matrix).all():
         return CameraFault.DEGENERATE

@@ -27,7 +27,7 @@ class Displacement:
     scale : float
         1 where lengths were right.
     covariance : (4, 4) float64
-        Of east and north (metres), of the turn counter-clockwise (radians) and of the scale.
+        Covariance of east and north (metres), the turn counter-clockwise (radians) and the scale.
     residual_m : float
         Root mean square of its residuals at the corners: a distortion that is no similarity.
     """
@@ -59,7 +59,7 @@ class Displacement:
 
     @property
     def significance(self) -> float:
-        """Squares of shift, turn and scale in units of their own errors: chi-square, 4 degrees, where there is none."""
+        """Squares of shift, turn and scale in units of their own errors: chi-square, 4 degrees, if nothing moved."""
         return float(self._parameters @ np.linalg.solve(self.covariance, self._parameters))
 
     @property
@@ -81,7 +81,7 @@ def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> D
     Parameters
     ----------
     end_covariance : (8, 8)
-        Of x and y of the corners in turn, square metres; positive definite.
+        Covariance of x and y of the corners in turn, square metres; positive definite.
     """
     about = start.mean(axis=0)
     x, y = (start - about).T

@@ -27,7 +27,7 @@ class Homography:
             return np.where(self.ahead(xy)[..., None], self.everywhere(xy), np.nan)
 
     def everywhere(self, xy: FloatArray) -> FloatArray:
-        """Map (..., 2) points, those beyond the horizon too: quicker where there are none (w > 0 over the image)."""
+        """Map (..., 2) points, also beyond the horizon: quicker where no point lies there (w > 0 over the image)."""
         mapped = self._homogeneous(xy)
         return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
@@ -87,6 +87,6 @@ class Homography:
 
 
 def map_each(matrices: FloatArray, xy: FloatArray) -> FloatArray:
-    """Map (K, N, 2) points, those of each of K homographies (K, 3, 3) by it; those beyond the horizon too."""
+    """Map (K, N, 2) points, N for each of K homographies (K, 3, 3); also beyond the horizon."""
     mapped = np.einsum("kij,knj->kni", matrices, np.concatenate((xy, np.ones((*xy.shape[:2], 1))), axis=2))
     return np.asarray(mapped[..., :2] / mapped[..., 2:])

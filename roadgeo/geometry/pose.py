@@ -5,7 +5,7 @@ A pinhole with square pixels whose axis meets the middle of the frame, above lev
 with its focal length. They are fitted to the corners by least squares, each corner weighed as its errors demand.
 
 Looking straight down, focal length and height cannot be told apart: a lens half as long at half the height sees the
-same. So an unknown focal length has a prior, that of usual lenses; where the homography does not determine it, it keeps
+same. So an unknown focal length has a prior from usual lenses; where the homography does not determine it, it keeps
 the prior's width, and so does the height. The parameters are chosen so that a focal length that is hardly determined
 changes without the others: where the axis meets the ground, metres per pixel there, and tilt per focal length. With
 position and angles themselves the sum of squares has a long, bent valley, in which an adjustment hardly moves.
@@ -43,7 +43,7 @@ class PoseOptions:
     focal_px : float or None
         Focal length, pixels of the frame; None: unknown.
     usual_focal : float
-        Of usual lenses, in halves of the frame's diagonal.
+        Focal length of usual lenses, in halves of the frame's diagonal.
     usual_sigma : float
         Standard deviation of the log of a usual focal length: between 35 and 85 degrees across the diagonal.
     told_sigma : float
@@ -68,7 +68,7 @@ class Pose:
     rotation : (3, 3) float64
         Camera axes to x, y of the plane and up.
     covariance : (6, 6) float64
-        Of the position, metres, and of heading, pitch and roll, degrees.
+        Covariance of the position, metres, and of heading, pitch and roll, degrees.
     focal_px, focal_sigma_px : float
         Focal length and its standard deviation: 0 where it was given.
     source : str
@@ -106,7 +106,7 @@ def find_pose(
     homography : (3, 3) float64
         Pixel (column, row; corner convention) to plane metres, x east and y north.
     corner_covariance : (8, 8) float64
-        Of the corners' x and y on the plane, square metres (see `Location.corner_covariance_m2`).
+        Covariance of the corners' x and y on the plane, square metres (see `Location.corner_covariance_m2`).
     """
     options = options or PoseOptions()
     frame = Frame(*size)
@@ -130,7 +130,7 @@ class SeenCorners(NamedTuple):
     """What is fitted to, and the prior on the focal length.
 
     `pixels` (4, 2) are the corners from the middle of the frame, y up; `ground` (4, 2) where they lie, metres;
-    `weights` (8, 8) whiten how far off they are; `log_focal` and its standard deviation are those of usual lenses.
+    `weights` (8, 8) whiten how far off they are; `log_focal` and its standard deviation come from usual lenses.
     """
 
     pixels: FloatArray
@@ -264,7 +264,7 @@ def _place(parameters: FloatArray, log_focal: float) -> tuple[FloatArray, FloatA
 
 
 def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, options: PoseOptions) -> Pose:
-    """Take parameters and their covariance to those of position and angles."""
+    """Take parameters and their covariance to position and angles and their covariance."""
     position, rotation = _place(p, log_focal)
 
     def placed(parameters: FloatArray) -> FloatArray:

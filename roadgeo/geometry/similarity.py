@@ -27,7 +27,7 @@ class Similarity(NamedTuple):
     """A similarity as a homography (3, 3), and the covariance (8, 8) of where it puts the corners.
 
     `doubt` (8, 8) is added to that where the camera may not have looked straight down: the parameters set aside
-    counts as an error, weighed by the share of level views of which less has to be. Of 958 frames tilted by up to 60
+    counts as an error, weighed by the share of level views of which less has to be. Among 958 frames tilted by up to 60
     degrees five were taken for level, and without it were off by two to ten times what was claimed.
     """
 
@@ -37,7 +37,7 @@ class Similarity(NamedTuple):
 
 
 def find_similarity(homography: FloatArray, corners: FloatArray, corner_covariance: FloatArray) -> Similarity | None:
-    """Return the similarity that is consistent with a homography; None where there is none.
+    """Return the similarity that is consistent with a homography; None without one.
 
     Generalised least squares of the corners' places on the four parameters; the weighted sum of squared residuals is
     chi-squared with four degrees of freedom if the camera looked straight down.
@@ -47,9 +47,9 @@ def find_similarity(homography: FloatArray, corners: FloatArray, corner_covarian
     homography : (3, 3) float64
         Does not mirror.
     corners : (4, 2) float64
-        Of the frame.
+        Corners of the frame.
     corner_covariance : (8, 8) float64
-        Of their places: x and y of the first, then of the second, and so on.
+        Covariance of their places: x and y of the first, then of the second, and so on.
     """
     if not np.isfinite(corner_covariance).all():
         return None

@@ -107,9 +107,9 @@ def warp(
         Homography from pixels (column, row; GDAL corner convention). Each point of the map has one source in the image
         plane, so nothing beyond the horizon is drawn twice.
     to_place : callable or None
-        Takes the grid's CRS to that of `pixel_to_crs`.
+        Takes the grid's CRS to the one of `pixel_to_crs`.
     lens : Lens, optional
-        Behind it the image is that of a pinhole, of which the homography speaks.
+        Behind it the image is a pinhole's, which the homography describes.
     """
     drawn = np.zeros((grid.height, grid.width, *image.shape[2:]), image.dtype)
     to_corner, to_center = np.eye(3), np.eye(3)  # OpenCV counts from the centre of the first pixel

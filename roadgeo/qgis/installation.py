@@ -121,7 +121,7 @@ def _read_folder(folder: Path) -> dict[Path, bytes]:
 
 
 def _publisher() -> dict[str, str]:
-    """Return the contacts in pyproject.toml, which are those of the whole package."""
+    """Return the contacts in pyproject.toml, which serve the whole package."""
     package = metadata.metadata("roadgeo")
     urls = dict(entry.split(", ", 1) for entry in package.get_all("Project-URL") or [])
     fields = {

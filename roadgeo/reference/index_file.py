@@ -334,7 +334,7 @@ def _is_count(value: object) -> TypeGuard[int]:
 
 
 def _manifest_problem(manifest: Any, size: int) -> str:
-    """Return the fault of a parsed manifest of a file whose data section has `size` bytes; '' when there is none."""
+    """Return the fault of a parsed manifest of a file whose data section has `size` bytes, or ''."""
     expected = {"format": int, "roadgeo": str, "about": dict, "size": int, "pickle": dict, "arrays": list}
     if type(manifest) is not dict or any(type(manifest.get(key)) is not kind for key, kind in expected.items()):
         return f"expected an object with {', '.join(expected)}"
@@ -351,7 +351,7 @@ def _manifest_problem(manifest: Any, size: int) -> str:
 
 
 def _arrays_problem(entries: list[Any], end: int, size: int) -> str:
-    """Return the fault of the array entries, which must follow each other from `end` to `size`; '' if there is none."""
+    """Return the fault of the array entries, which must follow each other from `end` to `size`, or ''."""
     if len(entries) > _MAX_ARRAYS:
         return f"expected at most {_MAX_ARRAYS} arrays, got {len(entries)}"
     names = set()

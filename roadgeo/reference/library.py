@@ -1,4 +1,4 @@
-"""The reference library: references by name, in the user's data folder (or that of `ROADGEO_LIBRARY`)."""
+"""The reference library: references by name, in the user's data folder (or in `ROADGEO_LIBRARY`)."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     Returns
     -------
     Path
-        Of its GeoPackage, which may be absent where the index stands alone; or of its folder of shards.
+        Path of its GeoPackage, which may be absent where the index stands alone; or of its folder of shards.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def resolve_whole(name_or_path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     IndexFormatError
-        There is none, or it is in shards.
+        There is no such reference, or it is in shards.
     """
     path = resolve_reference(name_or_path)
     manifest = manifest_path(path) if path.suffix == ENDING else None

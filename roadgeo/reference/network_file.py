@@ -1,8 +1,8 @@
 """A road network as an OGC GeoPackage: `REF.gpkg`, styled for QGIS, and back.
 
 Layers: `intersections` (the input of the index), `tangents` (short lines, to look at), `roads` (the noded
-network), `coverage` (where the map knows roads at all), and the table `roadgeo_meta`: JSON values by key, those of the
-program itself under `roadgeo.`. Angles are stored in degrees, counterclockwise from east.
+network), `coverage` (where the map knows roads at all), and the table `roadgeo_meta`: JSON values by key, the
+program's own under `roadgeo.`. Angles are stored in degrees, counterclockwise from east.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _TANGENT_LINE_M = 30.0
 #: Scales from which points and names are drawn in QGIS; before, they would hide the roads.
 _INTERSECTIONS_FROM, _NAMES_FROM = 50_000, 12_000
 
-#: Roads are drawn the wider the more they carry; those of an unknown kind as streets are.
+#: Roads are drawn the wider the more they carry; unknown kinds are drawn like streets.
 _WIDTHS_MM = {
     0.9: ("motorway", "trunk", "primary"),
     0.6: ("secondary", "tertiary", "motorway_link", "trunk_link", "primary_link"),
@@ -329,7 +329,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
 
 
 def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
-    """Columns of names and kinds of the streets; text, NULL where there is none."""
+    """Columns of names and kinds of the streets; text, or NULL."""
     known = {"name": network.names, "highway": network.kinds}
     return {key: [text or None for text in column.tolist()] for key, column in known.items() if column is not None}
 

@@ -117,7 +117,7 @@ def load_plain(pickled: bytes) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        They are none that `dump_plain` wrote.
+        `dump_plain` did not write them.
     """
     problem = _opcode_problem(pickled)
     if problem:

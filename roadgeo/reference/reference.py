@@ -48,7 +48,7 @@ class BuildOptions:
     index: IndexOptions = field(default_factory=IndexOptions)
 
 
-#: Of a coarse map, for images whose pixels show main roads alone.
+#: Options of a coarse map, for images whose pixels show main roads alone.
 COARSE = BuildOptions(simplify=SimplifyOptions().times(COARSENESS))
 
 
@@ -74,7 +74,7 @@ class Reference:
         """The references to search: itself."""
         return (Whole(self.index),)
 
-    def index_of(self, location: Location) -> ReferenceIndex:  # noqa: ARG002 (that of the one piece there is)
+    def index_of(self, location: Location) -> ReferenceIndex:  # noqa: ARG002 (there is one piece)
         """Return the index that a location is drawn with."""
         return self.index
 
@@ -189,7 +189,7 @@ def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
 def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
     """Open a reference: REF.gpkg with its REF.index, REF.shards, also at a URL, or one of the library by its name.
 
-    A missing index, or one of an earlier format, is built from the GeoPackage. Of shards only the manifest is read;
+    A missing index, or one of an earlier format, is built from the GeoPackage. For shards only the manifest is read;
     each is opened when it is first searched.
 
     >>> roadgeo.open_reference("porto.gpkg").name

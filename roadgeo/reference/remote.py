@@ -41,7 +41,7 @@ def fetch_manifest(url: str) -> Path:
     Raises
     ------
     IndexFormatError
-        There is none, it cannot be reached, or the URL is of another protocol.
+        No reference is there, it cannot be reached, or the URL is of another protocol.
     OutputError
         It cannot be kept in the user's cache folder.
     """

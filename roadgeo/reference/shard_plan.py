@@ -37,7 +37,7 @@ def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float, least_
     n_segments : mapping of cell to int
         Straight pieces of roads by cell.
     size : float
-        Of a cell, units of the CRS.
+        Side of a cell, units of the CRS.
     most : float
         Segments in a box, unless it is a single cell.
     least_cells : int

@@ -148,7 +148,7 @@ def _find_lines(roads: BoolArray, width: float, options: BorderOptions) -> list[
 
 
 def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line | None:
-    """Return the innermost line along the first rows that no road crosses; None where there is none."""
+    """Return the innermost line along the first rows that no road crosses, or None."""
     beyond = round(1.5 * width) + 1
     slopes = np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21)))
     found: list[tuple[float, _Line]] = []

@@ -77,7 +77,7 @@ class RoadGraph:
         Parameters
         ----------
         move : callable, optional
-            Takes positions (..., 2) from the plane to where the graph is to lie; lengths stay those of the plane.
+            Takes positions (..., 2) from the plane to where the graph is to lie; lengths stay as on the plane.
         **about
             The graph's own attributes: `crs`, as in osmnx, for example.
         """

@@ -58,7 +58,7 @@ def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
     Parameters
     ----------
     values : (L,) object
-        Values of `highway`: text, several in a list or in text (`"['a', 'b']"`, `a;b`), or None. Of several, one is
+        Values of `highway`: text, several in a list or in text (`"['a', 'b']"`, `a;b`), or None. Among several, one is
         enough. Lines without a value are roads of an unknown kind: all kinds but "main" take them.
     kind : RoadKind
 
@@ -73,7 +73,7 @@ def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
 
 
 def main_ranks(values: AnyArray) -> IntArray:
-    """Return (L,) the rank of each line among main roads, by values of `highway`: 0 for motorways; -1: it is none."""
+    """Return (L,) the rank of each line among main roads, by values of `highway`: 0 for motorways; -1: no main road."""
     ranks = np.full(len(values), -1)
     for rank, name in reversed(list(enumerate(MAIN_CLASSES))):
         ranks[_each(values, lambda names, name=name: bool(names & {name, f"{name}_link"}))] = rank

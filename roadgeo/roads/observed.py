@@ -29,7 +29,7 @@ class VoidOptions:
     straightness_px
         How far the ends may lie off their line.
     min_length
-        Of the line between the outermost ends, as a share of the frame's shorter side.
+        Length of the line between the outermost ends, as a share of the frame's shorter side.
     wide
         Beyond a line with this share of the frame, fewer roads need end on it: of 360 masks without a void 31 had one
         on which 3 roads end, and at most 0.07 of the frame lay beyond any of them.

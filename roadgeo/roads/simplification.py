@@ -28,7 +28,7 @@ __all__ = ["SimplifyOptions", "coverage", "planarize", "simplify"]
 #: Roads at a smaller angle than this run side by side.
 _PARALLEL_COS = float(np.cos(np.radians(25.0)))
 
-#: Of a map with more, memory that one step has freed is given back before the next needs its own.
+#: On a map with more, memory that one step has freed is given back before the next needs its own.
 _MANY_EDGES = 100_000
 
 #: Limits on lines, far above any map that can be indexed: beyond them they would fill the memory.
@@ -312,7 +312,7 @@ def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph
 def narrow_faces(follow: IntArray, area: FloatArray, lengths: FloatArray, width: float, longest: float) -> IntArray:
     """Return the first half-edge (2 E,) of the narrow face on the left of each half-edge, -1 for other faces.
 
-    `follow` and `area` are those of `_walk_faces`, `lengths` (E,). A face is narrow when twice its area is less than
+    `follow` and `area` come from `_walk_faces`, `lengths` (E,). A face is narrow when twice its area is less than
     `width` times its perimeter, which is less than `longest`.
     """
     first, ahead = np.arange(len(follow)), follow

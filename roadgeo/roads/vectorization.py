@@ -54,7 +54,7 @@ class VectorizeOptions:
         A mask that falls into more pieces of road is noise and is refused, so that time and memory are bounded.
     max_cover
         Traced lines are noise, too, if roads of their length and width would cover more than this share of the frame:
-        those of a dense town cover 0.16.
+        the roads of a dense town cover 0.16.
     closing_widths, opening_widths
         Gaps up to this are closed; threads up to this are cut.
     hole_areas, speck_areas
@@ -179,7 +179,7 @@ def road_width(mask: RoadMask) -> float:
     """Estimate the usual road width of a mask in pixels: by area (see `width_by_area`).
 
     Where wide streets run together over more ground than all distinct ones cover, as towards the horizon of a steep
-    view, it is that of most roads by their length.
+    view, it is the width of most roads by their length.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def width_by_area(mask: RoadMask) -> float:
 
 
 def _width_by_area(mask: RoadMask, depths: IntArray) -> float:
-    """Return that of `width_by_area`, given the mask's depths; wide roads are looked at again in a smaller picture."""
+    """Return the result of `width_by_area`, given depths; wide roads are looked at again in a smaller picture."""
     roads, width = mask.roads.view(np.uint8), _width(depths)
     factor = min(int(width / 8), min(roads.shape) // 16)
     if width <= _BAND_ROWS / 3 or factor < 2:

@@ -29,7 +29,7 @@ __all__ = ["MAX_ZOOM", "Tiles"]
 MAX_ZOOM = 15
 _EXTENT = 4096
 _WORLD_M = 2 * 20037508.342789244
-#: Shards that one tile is made of, and segments that it holds: those of a whole country are a grey field anyway.
+#: Shards that one tile is made of, and segments that it holds: the roads of a whole country are a grey field anyway.
 _MOST_SHARDS, _MOST_SEGMENTS = 16, 60_000
 #: Streets of a map whose names are shown.
 _MOST_STREETS = 200_000

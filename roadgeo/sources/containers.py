@@ -54,7 +54,7 @@ def stream_tables(
     Parameters
     ----------
     layer : str, optional
-        Of a file with several; the one with lines by default, all of a GPX or KML file.
+        Layer of a file with several; the one with lines by default, all of a GPX or KML file.
     advance : callable
         Called with the share of the file that is read.
     folder : Path

@@ -48,12 +48,12 @@ class Drawing:
 
 
 def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str | None = None) -> Drawing:
-    """Read the roads of a file as `read_roads` does and draw them: lines, or where there are none polygons.
+    """Read the roads of a file as `read_roads` does and draw them: lines, or without lines polygons.
 
     Parameters
     ----------
     layer : str, optional
-        Of a file with several.
+        Layer of a file with several.
     units : "auto", "pixels" or "metres"
         Units of their coordinates. By default degrees or metres where the file names a CRS that they fit, and pixels of
         a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.

@@ -18,7 +18,7 @@ __all__ = ["ground_heights"]
 def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> FloatArray:
     """Return the heights, metres, of a terrain model at points (N, 2) of a CRS; NaN where it knows none.
 
-    Of each point the pixel that it lies in.
+    Each point takes the pixel that it lies in.
 
     Raises
     ------

@@ -34,7 +34,7 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
 
 
 def focal_in_pixels(image: str, photo: str | None = None) -> float:
-    """Return the focal length in pixels of an image, as EXIF states it: its own, or that of its photograph.
+    """Return the focal length in pixels of an image, as EXIF states it: its own, or its photograph's.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
 
 
 def _number(text: str) -> float:
-    """Return the number in an EXIF value such as "(24)"; 0 where there is none."""
+    """Return the number in an EXIF value such as "(24)"; 0 without a number."""
     try:
         return float(text.strip("() "))
     except ValueError:

@@ -31,7 +31,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     Parameters
     ----------
     crs : str, optional
-        Of a world file, as pyproj takes it, or in place of that of the raster, or of a `.prj` beside it.
+        CRS of a world file, as pyproj takes it; it replaces the raster's own and a `.prj` beside it.
 
     Raises
     ------

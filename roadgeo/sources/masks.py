@@ -132,7 +132,7 @@ class MaskSource:
         Raises
         ------
         MaskError
-            There are none, or hardly others.
+            There are no roads, or hardly anything else.
         """
         name, is_mask = self._raster.name, self._raster.model_threshold is None
         roads, observed = _separate(self._raster, self._channel, threshold)
@@ -271,7 +271,7 @@ def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArra
 
 
 def _between(raster: _Raster, channel: int, ground: float, road: float) -> AnyArray:
-    """Return where values of a band lie between those of ground and road, as `RoadMask.probability`."""
+    """Return where values of a band lie between ground and road, as `RoadMask.probability`."""
     shares = np.full(raster.shape, PROBABILITY_UNKNOWN, np.uint8)
     for strip in _strips(raster, 1):
         values, valid = raster.read(strip.start, strip.stop, 1)

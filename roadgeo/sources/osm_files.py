@@ -37,7 +37,7 @@ _Way = tuple[Any, str, str | None, str | None]  # line, highway, tunnel, name
 def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder: Path) -> Iterator[RoadTable]:
     """Yield the ways with a `highway` tag that exist, in their newest versions, in parts of bounded size.
 
-    Nodes may stand behind ways or be left out where ways bring their places along. Of a way cut off by an extract it is
+    Nodes may stand behind ways or be left out where ways bring their places along. A way cut off by an extract is
     the part whose nodes are there; ways without any are counted.
 
     Parameters

@@ -232,7 +232,7 @@ def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
     Raises
     ------
     CrsError
-        There is none.
+        There is no file.
     """
     if crs is None or source.meta.get("format") == "OpenStreetMap":
         if source.crs is None:

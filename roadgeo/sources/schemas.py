@@ -1,7 +1,7 @@
 """One adapter from tables of any schema to roads: kind of each, tunnel or not, name, attribution.
 
 A schema is recognised by its words, listed in `schemas.toml`: `residential` is OpenStreetMap's, `A Road` the Ordnance
-Survey's, `S1400` that of TIGER. Columns with well-known names are looked at first, then any that hold such words.
+Survey's, `S1400` is TIGER's. Columns with well-known names are looked at first, then any that hold such words.
 Numbers count in columns that are known by name alone. Other lines (a stream, a fence, a railway) are left
 out and counted; a road whose kind is not known stays one.
 """

@@ -1,4 +1,4 @@
-"""The straight line of a road file: container, table, adapter, lines; of a folder those of its files that are roads."""
+"""The straight line of a road file: container, table, adapter, lines; of a folder, all its files that are roads."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def read_lines(
     ----------
     path : Path
     layer : str, optional
-        Of a file with several; the one with lines by default.
+        Layer of a file with several; the one with lines by default.
     advance : callable, optional
         Called with the share of the file that is read.
     areas : bool

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NoCrsError", "all_text", "crs_name", "file_in_bytes", "known_crs", "name_crs", "named_file"]
 
-#: Keys of PROJ's strings that take files, "value" that of PROJJSON; pyproj drops a plus or a blank beside the sign.
+#: Keys of PROJ's strings that take files, "value" PROJJSON's; pyproj drops a plus or a blank beside the sign.
 _KEYS = re.compile(
     r"(?:(?:grids|file|model|^value)[\s+]*=[\s+]*|\"value\"\s*:\s*)(?:\"+([^\"]*)|([^\s\"]*))", re.I | re.M
 )
@@ -51,7 +51,7 @@ def known_crs(crs: Any) -> CRS:
     CrsError
         It names a file that is none of PROJ's own.
     pyproj.exceptions.CRSError
-        It is none.
+        It is no CRS.
     """
     return _known(crs) if isinstance(crs, str) else _checked(crs)
 
@@ -64,7 +64,7 @@ def name_crs(crs: Any) -> str:
     Raises
     ------
     NoCrsError
-        It is none, or none of places on a map.
+        It is no CRS, or not one of places on a map.
     CrsError
         It names a file that is none of PROJ's own.
     """
@@ -84,7 +84,7 @@ def name_crs(crs: Any) -> str:
 
 
 def crs_name(crs: Any) -> str | None:
-    """Return a CRS as `name_crs` does; None where there is none, or one that is bound to no place on Earth."""
+    """Return a CRS as `name_crs` does; None without one, or where it is bound to no place on Earth."""
     try:
         return None if crs is None else name_crs(crs)
     except NoCrsError:

@@ -63,7 +63,7 @@ def _refuse(path: Path, name: str) -> None:
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return the files of a geodatabase, or those of a map's name; refuse what is no regular file among them."""
+    """Return the files of a geodatabase, or the files of a map's name; refuse what is no regular file among them."""
     folder, start = (path, "") if path.is_dir() else (path.parent, f"{path.stem}.")
     parts = []
     with os.scandir(folder) as entries:

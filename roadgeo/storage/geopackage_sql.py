@@ -1,4 +1,4 @@
-"""The SQL of a GeoPackage: its tables, those of QGIS's styles, and the triggers that keep spatial indexes true."""
+"""The SQL of a GeoPackage: its tables, QGIS's tables of styles, and the triggers that keep spatial indexes true."""
 
 __all__ = ["NOW", "RTREE_TRIGGERS", "SCHEMA", "STYLES_SCHEMA"]
 

@@ -17,7 +17,7 @@ __all__ = ["give_back_memory", "let_pages_go"]
 def give_back_memory() -> None:
     """Give memory that is free within this process back to the system, where its C library can.
 
-    That of many small objects, as geometries are, is kept by glibc for more of their kind: cutting a million lines
+    Memory of many small objects, such as geometries, is kept by glibc for more of their kind: cutting a million lines
     where they cross leaves 1.9 GB of it, and arrays take none of that.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):  # not on macOS, Windows and musl

@@ -51,7 +51,7 @@ def read_blob(file: BinaryIO) -> bytes:
     Raises
     ------
     RuntimeError
-        As osmium does: it is cut off, or there is none.
+        As osmium does: it is cut off, or missing.
     """
     from google.protobuf.message import DecodeError
 

@@ -80,7 +80,7 @@ _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 def open_raster(
     path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False, upright: bool = True
 ) -> Iterator[DatasetReader]:
-    """Open a raster that may lack a georeference; errors while it is open are raised as those of opening it.
+    """Open a raster that may lack a georeference; errors while it is open are raised like errors of opening it.
 
     One that is to be turned (see `storage.orientation`) is turned, and its georeference with it: in memory, by another
     driver. Rasters to be written meanwhile are opened with `writing_raster`.

@@ -86,10 +86,10 @@ def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
 def read_layer(
     path: Path, layer: str | None, columns: Sequence[str], skip: int = 0, most: int | None = None
 ) -> VectorLayer:
-    """Read a layer (the first by default), with those of the named columns that it has.
+    """Read a layer (the first by default), with the named columns, as far as it has them.
 
     The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
-    names is read as Latin-1, which may garble it, and that is reported. Errors are those of `list_layers`.
+    names is read as Latin-1, which may garble it, and that is reported. It raises as `list_layers` does.
     """
     import pyogrio
 
@@ -218,7 +218,7 @@ def _require_stored(path: Path, layer: str | None = None) -> None:
 
 
 def _computed(database: sqlite3.Connection, layer: str | None) -> list[str]:
-    """Return the computed columns and tables: GeoPackage's own, which GDAL reads in any case, or those of one layer."""
+    """Return the computed columns and tables: GeoPackage's own, which GDAL reads in any case, or one layer's."""
     if layer is None:
         names = [name for (name,) in database.execute(_OWN_TABLES)]
         return [problem for problem in (table_problem(database, name) for name in names) if problem]

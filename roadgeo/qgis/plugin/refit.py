@@ -41,7 +41,7 @@ class Fit:
     matrix : (3, 3) float64 or None
         Pixel (column, row) to map; None where too few matches are on, or they lie on a line.
     residuals : list of float
-        Of each match, on or off, map units from where the fit puts it; NaN without a fit.
+        Distance of each match, on or off, in map units from where the fit puts it; NaN without a fit.
     """
 
     matrix: np.ndarray | None
@@ -59,7 +59,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
     Raises
     ------
     ValueError
-        It is none.
+        It is no list of points.
     """
     try:
         lines = Path(path).read_text("utf-8-sig").splitlines()

@@ -128,7 +128,7 @@ def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
     Parameters
     ----------
     labels : mapping
-        Of the options of the algorithm that runs, by their names on the command line.
+        Labels of the options of the algorithm that runs, by their names on the command line.
     """
     text = re.sub(
         r"`roadgeo (\w+)[^`]*`", lambda found: f"“{_COMMANDS[found[1]]}”" if found[1] in _COMMANDS else found[0], text

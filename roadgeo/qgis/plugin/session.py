@@ -41,7 +41,7 @@ class Finding:
     Attributes
     ----------
     name, picture, points, page : str
-        Name of the picture; the files of it, of its matched intersections and of the report, "" where there is none.
+        Name of the picture; the files of it, of its matched intersections and of the report, "" without one.
     location : dict
         Output of the program.
     parameters : dict

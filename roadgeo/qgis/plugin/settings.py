@@ -52,7 +52,7 @@ def configure(path: str) -> None:
 
 
 def locate_executable() -> str | None:
-    """Return the path of the program, or of a Python that has it; None where there is none."""
+    """Return the path of the program, or of a Python that has it, or None."""
     configured = str(ProcessingConfig.getSetting(_EXECUTABLE) or "")
     return find_executable(configured, os.environ, Path.home(), Path(__file__).parent)
 

@@ -21,7 +21,7 @@ def _files() -> dict[str, Path]:
 
 
 def page_file(name: str) -> Path | None:
-    """Return a file of the page by its name, compressed if its own name ends in `.gz`; None where there is none."""
+    """Return a file of the page by its name, compressed if its own name ends in `.gz`; None without such a file."""
     return _files().get(name)
 
 

@@ -44,9 +44,9 @@ class ModelCard:
     resolution_m : float or None
         Metres per pixel that it was made for.
     tile : (height, width)
-        Of its input, pixels.
+        Size of its input, pixels.
     kind : str
-        Of the numbers that it takes, as NumPy calls it; "uint8": RGB as it is, neither shifted nor scaled.
+        Type of the numbers that it takes, as NumPy calls it; "uint8": RGB as it is, neither shifted nor scaled.
     channels_last : bool
         Whether it takes (1, height, width, 3) instead of (1, 3, height, width).
     overlap : float
@@ -60,7 +60,7 @@ class ModelCard:
     output : str
         The output that shows roads.
     channels : tuple of int
-        Those that are road: their probabilities are added. Of classes those that are; none: all but 0.
+        Channels that are road, whose probabilities are added; or classes that are road. Empty: all but 0.
     gives_classes : bool
         Whether the output is the class of each pixel (argmax).
     is_probability : bool or None
@@ -214,7 +214,7 @@ def _choose_classes(output: Port, names: dict[int, str], class_name: str | None)
 
 
 def _wanted(names: dict[int, str], class_name: str | None) -> list[int]:
-    """Return the numbers of the classes that are road: those of the given name, else those named after roads."""
+    """Return the numbers of the classes that are road: by the given name, else by names of roads."""
     if class_name is None:
         return [key for key, name in names.items() if _is_road(name)]
     return [key for key, name in names.items() if class_name in (name, str(key))]

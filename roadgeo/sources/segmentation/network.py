@@ -64,7 +64,7 @@ class Network:
         Returns
         -------
         (rows, columns) float32
-            Of the size `seen`.
+            Probabilities, of the size `seen`.
         """
         road = self._to_probability(self._run(tile))
         if road.shape != self._size:

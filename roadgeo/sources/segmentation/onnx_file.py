@@ -57,9 +57,9 @@ class Port(NamedTuple):
     ----------
     name : str
     kind : str
-        Of its values, as NumPy calls it: "float32", "uint8" ...
+        Type of its values, as NumPy calls it: "float32", "uint8" ...
     shape : tuple
-        Of its sizes None means any; () is an unknown shape.
+        Its sizes; None means any, () is an unknown shape.
     """
 
     name: str
@@ -217,7 +217,7 @@ def _open_session(content: bytes, threads: int) -> Any:
     options.log_severity_level = 4  # errors are raised, and need not be printed too
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
-    options.add_session_config_entry("session.use_env_allocators", "1")  # those of `_limit_memory`
+    options.add_session_config_entry("session.use_env_allocators", "1")  # set by `_limit_memory`
     options.add_session_config_entry("session.load_model_format", "ONNX")  # what was looked at, whatever else it may be
     # Constants that operators make are made while the model runs, when memory is bounded.
     return onnxruntime.InferenceSession(

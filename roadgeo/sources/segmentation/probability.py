@@ -36,7 +36,7 @@ class ProbabilityMap:
     threshold : float
         Probabilities above it are road, by the model's own word.
     name : str
-        Of the photograph.
+        Size of the photograph.
     model : str
         Its maker.
     pixel : float
@@ -121,7 +121,7 @@ class ProbabilityMap:
 def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
     """Fuse looks at one scene: the mean of the log odds of those that saw a pixel; the frame is the first one's.
 
-    Those of one threshold mean the same by a probability, which is kept; of others only the thresholds mean the same.
+    Models of one threshold mean the same by a probability, which is kept; of others only the thresholds mean the same.
 
     Raises
     ------
