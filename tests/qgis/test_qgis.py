@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -216,14 +215,6 @@ def test_a_mask_is_vectorized_and_each_run_has_its_own_group(qgis: Qgis) -> None
         assert run["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
 
 
-def test_a_photograph_is_vectorized(qgis: Qgis) -> None:
-    photo = MASKS["drone"].path.with_name("drone_photo.jpg")
-    done = qgis.run("vectorizemask", MASK=photo, OUTPUT_FOLDER=qgis.folder / "seen", GSD="0.8:1.2")
-    assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
-    assert all(layer["features"] > 30 for layer in done["layers"].values())
-    assert (qgis.folder / "seen" / "drone_photo_mask.tif").exists()
-
-
 def test_where_masks_would_be_located_is_mapped(qgis: Qgis, porto: Path) -> None:
     folder = qgis.folder / "where"
     done = qgis.run("maplocalizability", REFERENCE=porto, OUTPUT_FOLDER=folder, COUNT=4, NOISE="clean")
@@ -315,85 +306,26 @@ def coordinate_picture(path: Path, size: tuple[int, int]) -> Path:
     return path
 
 
-@dataclass(frozen=True)
-class Warped:
-    """A coordinate picture on the map: the raster, its control points, and the homography that both are to follow."""
-
-    footprint: Path
-    points: Path
-    homography: Homography
-    size: tuple[int, int]
-
-    def pixels(self) -> np.ndarray:
-        """(N, 2) places all over the picture."""
-        columns, rows = (np.linspace(8, side - 8, 12) for side in self.size)
-        return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-
-    def places(self) -> tuple[np.ndarray, float]:
-        """(N, 2) centres of the raster's pixels all over it, on the map, and how large those are."""
-        with rasterio.open(self.footprint) as raster:
-            resolution, corner = raster.res[0], (raster.bounds.left, raster.bounds.top)
-        steps = np.array((resolution, -resolution))
-        return corner + (np.floor((self.homography(self.pixels()) - corner) / steps) + 0.5) * steps, resolution
-
-
-def disagreements(qgis: Qgis, pictures: list[Warped]) -> tuple[float, float]:
-    """Say by how many pixels QGIS and the homographies differ at most, and by how many metres the control points."""
-    tasks = []
-    for one in pictures:
-        tasks.append(("sample", {"path": str(one.footprint), "points": one.places()[0].tolist(), "bands": [1, 2]}))
-        tasks.append(("project", {"points": str(one.points), "pixels": one.pixels().tolist()}))
-    answers, _, _ = qgis.ask(*tasks)
-    pixels, metres = [], []
-    for one, sampled, projected in zip(pictures, answers[::2], answers[1::2], strict=True):
-        places, resolution = one.places()
-        shown = one.homography(np.array(sampled, float) / 16)
-        pixels.append(np.hypot(*(shown - places).T).max() / resolution)
-        metres.append(np.hypot(*(np.array(projected) - one.homography(one.pixels())).T).max())
-    return max(pixels), max(metres)
-
-
 def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis, porto: Path) -> None:
-    """A tilted camera, and a picture of another size than its mask."""
+    """A tilted camera, and a picture of another size than its mask: as QGIS shows it, and by its control points."""
     mask, folder = MASKS["drone"].path, qgis.folder / "image"
     height, width = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE).shape
-    size = (width // 2, height // 2)
-    picture = coordinate_picture(qgis.folder / "photo.tif", size)
+    picture = coordinate_picture(qgis.folder / "photo.tif", (width // 2, height // 2))
     inputs = {"IMAGE": picture, "MASK": mask, "REFERENCE": porto, "OUTPUT_FOLDER": folder}
     done = qgis.run("georeferenceimage", **inputs, PRODUCTS=list(ALSO), RESAMPLING="bilinear")
     assert done["results"]["STATUS"] == "located"
+    assert all(product.path(folder, "drone", "photo.tif").exists() for product in ALSO.values())
     _, document = read_location(folder / "drone_location.json")
     homography = Homography(np.array(document["homography"]) @ np.diag([2, 2, 1]))
-    warped = Warped(folder / "drone_footprint.tif", folder / "photo.tif.points", homography, size)
-    pixels, metres = disagreements(qgis, [warped])
-    assert pixels < 0.6
-    assert metres < 0.01
-    assert all(product.path(folder, "drone", "photo.tif").exists() for product in ALSO.values())
-
-
-@pytest.mark.realdata
-def test_ten_real_masks_agree_with_their_homographies(qgis: Qgis, data_dir: Path) -> None:
-    reference, photos, folder = qgis.folder / "boston.gpkg", qgis.folder / "photos", qgis.folder / "ten"
-    roads = data_dir / "boston" / "boston_osm_roads.gpkg"
-    assert qgis.run("buildreference", ROADS=roads, OUTPUT=reference)["results"]["OUTPUT"] == str(reference)
-    tiles = (data_dir / "massachusetts" / "tiles.csv").read_text("utf-8").splitlines()
-    stems = [row.partition(",")[0] for row in tiles if ",True," in row][:10]
-    photos.mkdir()
-    picture = coordinate_picture(photos / f"{stems[0]}.tif", (1500, 1500))
-    for stem in stems[1:]:
-        shutil.copy(picture, photos / f"{stem}.tif")
-    masks = [str(data_dir / "massachusetts" / "masks" / f"{stem}.png") for stem in stems]
-    options = ["--reference", str(reference), "--out-dir", str(folder), "--resampling", "bilinear", "--also", "points"]
-    assert main(["locate", *masks, "--image", str(photos), *options, "-q"]) == 0
-    warped = [
-        Warped(
-            folder / f"{stem}_footprint.tif",
-            folder / f"{stem}.tif.points",
-            read_location(folder / f"{stem}_location.json")[0],
-            (1500, 1500),
-        )
-        for stem in stems
-    ]
-    pixels, metres = disagreements(qgis, warped)
-    assert pixels < 0.6
-    assert metres < 0.01
+    columns, rows = (np.linspace(8, side - 8, 12) for side in (width // 2, height // 2))
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    with rasterio.open(folder / "drone_footprint.tif") as raster:
+        resolution, corner = raster.res[0], (raster.bounds.left, raster.bounds.top)
+    steps = np.array((resolution, -resolution))
+    places = corner + (np.floor((homography(pixels) - corner) / steps) + 0.5) * steps  # centres of the raster's pixels
+    (sampled, projected), _, _ = qgis.ask(
+        ("sample", {"path": str(folder / "drone_footprint.tif"), "points": places.tolist(), "bands": [1, 2]}),
+        ("project", {"points": str(folder / "photo.tif.points"), "pixels": pixels.tolist()}),
+    )
+    assert np.hypot(*(homography(np.array(sampled, float) / 16) - places).T).max() < 0.6 * resolution
+    assert np.hypot(*(np.array(projected) - homography(pixels)).T).max() < 0.01
