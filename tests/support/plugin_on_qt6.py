@@ -120,7 +120,7 @@ def main():
     location = {"reason": "two places fit", "footprint_lonlat": None}
     dialog = loaded["places"].PlacesDialog("locatemask", MagicMock(location=location))
     application.processEvents()
-    print(json.dumps({"algorithms": algorithms, "status": dock.status.text(), "rows": dialog.table.rowCount()}))
+    print(json.dumps({"algorithms": algorithms, "status": dock.status.text(), "rows": dialog.list.topLevelItemCount()}))
 
 
 main()

@@ -181,13 +181,13 @@ def choose(messages, window):
     keep(iface.mainWindow(), "ambiguous")
     buttons["Choose the place..."].click()
     dialog = window.OPEN[-1]
-    dialog.table.selectRow(1)
+    dialog.list.setCurrentItem(dialog.list.topLevelItem(1))
     settle()
     iface.mapCanvas().waitWhileRendering()
     extent = iface.mapCanvas().extent()
     ANSWER["looked_at"] = extent.center().x()
     keep(dialog, "places")
-    ANSWER["places"] = [[dialog.table.item(row, k).text() for k in (1, 2, 3)] for row in range(dialog.table.rowCount())]
+    ANSWER["places"] = [[dialog.list.topLevelItem(row).text(k) for k in (1, 2, 3)] for row in range(len(dialog.places))]
     dialog.button.click()
     again = window.OPEN[-1]
     values = again.createProcessingParameters()
@@ -209,7 +209,7 @@ def choose(messages, window):
 
 
 def residuals(dock):
-    return [float(dock.table.item(k, 1).text() or "nan") for k in range(dock.table.rowCount())]
+    return [float(row.text(1) or "nan") for row in dock.rows]
 
 
 def mend(dock):
@@ -221,15 +221,15 @@ def mend(dock):
     dock._zoom()
     dock.view.waitWhileRendering()
     dock.canvas.waitWhileRendering()
-    answer["head"] = dock.table.horizontalHeaderItem(1).text()
+    answer["head"] = dock.list.headerItem().text(1)
     answer["before"], answer["said"] = residuals(dock), dock.status.text()
     answer["points"] = [[one.column, one.row, one.x, one.y] for one in dock.matches]
     answer["matches"] = len(dock.matches)
-    dock.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
+    dock.rows[0].setCheckState(0, Qt.CheckState.Unchecked)
     answer["off"], answer["said_off"] = residuals(dock), dock.status.text()
-    dock.table.item(0, 0).setCheckState(Qt.CheckState.Checked)
+    dock.rows[0].setCheckState(0, Qt.CheckState.Checked)
     # Dragged on the map, by 30 pixels to the right.
-    dock.table.selectRow(1)
+    dock.list.setCurrentItem(dock.rows[1])
     one = dock.matches[1]
     start = dock.canvas.pixel(1).toPoint()
     drag(dock.canvas.viewport(), start, start + QPoint(30, 0))
@@ -237,22 +237,22 @@ def mend(dock):
     answer["pixel_m"] = dock.canvas.mapUnitsPerPixel()
     answer["dragged"] = residuals(dock)
     # Sorted by residuals, the largest first; and taken back.
-    dock.sort(1, Qt.SortOrder.DescendingOrder)
-    answer["sorted"] = [[int(dock.table.item(k, 0).text()) for k in range(dock.table.rowCount())], residuals(dock)]
-    dock.sort(0, Qt.SortOrder.AscendingOrder)
+    dock.list.header().setSortIndicator(1, Qt.SortOrder.DescendingOrder)
+    shown = [dock.list.topLevelItem(k) for k in range(dock.list.topLevelItemCount())]
+    answer["sorted"] = [[int(row.text(0)) for row in shown], [float(row.text(1)) for row in shown]]
+    dock.list.header().setSortIndicator(0, Qt.SortOrder.AscendingOrder)
     dock.undo()
     answer["undone"] = [dock.matches[1] == one, residuals(dock)]
     # Dragged on the picture, where others lie beside it: the one that is chosen lies on top.
-    dock.table.selectRow(2)
+    dock.list.setCurrentItem(dock.rows[2])
     two = dock.matches[2]
     start = dock.view.pixel(2).toPoint()
     drag(dock.view.viewport(), start, start + QPoint(0, 25))
     answer["moved_px"] = dock.matches[2].row - two.row
     # Both are deleted; one is added by a click on the picture.
-    dock.table.clearSelection()
-    for row in (1, 2):
-        for column in range(3):
-            dock.table.item(row, column).setSelected(True)
+    dock.list.clearSelection()
+    for row in dock.rows[1:3]:
+        row.setSelected(True)
     dock.delete_chosen()
     answer["deleted"] = len(dock.matches)
     dock.buttons["Add points"].click()

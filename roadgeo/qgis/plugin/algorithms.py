@@ -225,9 +225,12 @@ class LocateMasks(RoadgeoAlgorithm):
         masks, folder = values.path("String", "MASKS"), values.path("String", "OUTPUT_FOLDER")
         to = ["--json", f"--out-dir={folder}", *_references(values)]
         found = session.call("locate", masks, *to, *self.arguments(values), some_may_fail=True)
-        results = {"OUTPUT_FOLDER": folder, **_count(found)}
+        statuses = [location["status"] for location in found]
+        located, failed = statuses.count("located"), statuses.count("error")
+        results = {"OUTPUT_FOLDER": folder, "LOCATED": located, "FAILED": failed}
+        results["NOT_LOCATED"] = len(statuses) - located - failed
         summary = Path(folder) / "roadgeo_summary.gpkg"
-        if results["LOCATED"] and summary.exists():
+        if located and summary.exists():
             results["SUMMARY"] = session.show(summary, "Footprints", "footprints")
         return results
 
@@ -310,12 +313,6 @@ def _show_location(location: dict[str, Any], stem: Path, kept: dict[str, str], s
     }
 
 
-def _count(found: list[dict[str, Any]]) -> dict[str, Any]:
-    statuses = [location["status"] for location in found]
-    located, failed = statuses.count("located"), statuses.count("error")
-    return {"LOCATED": located, "NOT_LOCATED": len(statuses) - located - failed, "FAILED": failed}
-
-
 class PlaceByPoints(RoadgeoAlgorithm):
     """A picture by control points that somebody set."""
 
@@ -333,11 +330,11 @@ class PlaceByPoints(RoadgeoAlgorithm):
 
         picture, folder = values.raster("IMAGE"), values.path("String", "OUTPUT_FOLDER")
         location, rms = make_location(picture, values.get("File", "POINTS"))
-        told = Path(folder) / f"{Path(picture).stem}_placed.json"
-        told.parent.mkdir(parents=True, exist_ok=True)
-        told.write_text(json.dumps(location), "utf-8")
-        session.call("apply", str(told), picture, f"--out-dir={folder}", *self.arguments(values))
         name = Path(picture).stem
+        path = Path(folder) / f"{name}_placed.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(location), "utf-8")
+        session.call("apply", str(path), picture, f"--out-dir={folder}", *self.arguments(values))
         drawn = session.show(Path(folder) / f"{name}_footprint.tif", f"{name} by points")
         return {"OUTPUT_FOLDER": folder, "FOOTPRINT": drawn, "RMS": rms}
 
@@ -369,8 +366,8 @@ class SetUp(RoadgeoAlgorithm):
         else:
             found = program or locate_executable() or ""
         if not found:
-            told = f"To install it, tick “{given.SETUP[1].label}”, or name it above."
-            raise QgsProcessingException(f"The program roadgeo was not found on this computer. {told}")
+            advice = f"To install it, tick “{given.SETUP[1].label}”, or name it above."
+            raise QgsProcessingException(f"The program roadgeo was not found on this computer. {advice}")
         self.found = {"FOUND": found, "VERSION": ask_version(found, session)}
         return self.found
 
@@ -384,13 +381,4 @@ class SetUp(RoadgeoAlgorithm):
         return super().postProcessAlgorithm(context, feedback)
 
 
-ALGORITHMS = (
-    BuildReference,
-    LocateMask,
-    LocateMasks,
-    VectorizeMask,
-    GeoreferenceImage,
-    MapLocalizability,
-    PlaceByPoints,
-    SetUp,
-)
+ALGORITHMS = tuple(RoadgeoAlgorithm.__subclasses__())

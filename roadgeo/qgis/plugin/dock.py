@@ -35,8 +35,8 @@ from qgis.PyQt.QtWidgets import (
     QMenu,
     QPushButton,
     QSplitter,
-    QTableWidget,
-    QTableWidgetItem,
+    QTreeWidget,
+    QTreeWidgetItem,
     QVBoxLayout,
     QWidget,
 )
@@ -53,6 +53,17 @@ __all__ = ["MatchDock"]
 _ON, _OFF, _CHOSEN, _FRAME = (QColor(color) for color in ("#1f6fb4", "#9a9a9a", "#e4572e", "#1f6fb4"))
 
 
+class _Row(QTreeWidgetItem):
+    """A row of the list, sorted by the values that it shows."""
+
+    keys: tuple[Any, ...] = (0, 0.0, (0.0, 0.0))
+
+    def __lt__(self, other: Any) -> bool:
+        """Whether it comes before another row."""
+        column = self.treeWidget().header().sortIndicatorSection()
+        return bool(self.keys[column] < other.keys[column])
+
+
 class MatchDock(QDockWidget):
     """The panel.
 
@@ -62,8 +73,8 @@ class MatchDock(QDockWidget):
         The current ones; `found` is the fit through them.
     apart : list of float
         Distance of each, on or off, from where the fit puts it: metres where the CRS is known, else map units.
-    order : list of int
-        The matches in the order of the list's rows.
+    rows : list of _Row
+        The matches in the list, which may be sorted otherwise.
     adding : bool
         Whether a click adds a point.
     """
@@ -74,7 +85,7 @@ class MatchDock(QDockWidget):
         self.matches: list[Match] = []
         self.found = Fit(None)
         self.apart: list[float] = []
-        self.order: list[int] = []
+        self.rows: list[_Row] = []
         self.crs, self.picture, self.size = "", "", (0, 0)
         self._past: list[list[Match]] = []
         self._clicked: dict[str, tuple[float, float]] = {}
@@ -83,16 +94,16 @@ class MatchDock(QDockWidget):
         self.band = QgsRubberBand(self.canvas, QgsWkbTypes.GeometryType.PolygonGeometry)
         self.band.setStrokeColor(_FRAME)
         self.band.setFillColor(QColor(31, 111, 180, 30))
-        self.table = QTableWidget(0, 3)
-        self.table.verticalHeader().hide()
-        self.table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        self.table.horizontalHeader().setSectionsClickable(True)
-        self.table.horizontalHeader().setSortIndicator(0, Qt.SortOrder.AscendingOrder)
-        self.table.horizontalHeader().setSortIndicatorShown(True)
-        self.table.horizontalHeader().sortIndicatorChanged.connect(self.sort)
-        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
-        self.table.itemChanged.connect(self._switched)
-        self.table.itemSelectionChanged.connect(self._paint)
+        self.list = QTreeWidget()
+        self.list.setRootIsDecorated(False)
+        self.list.setSelectionMode(QTreeWidget.SelectionMode.ExtendedSelection)
+        self.list.header().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        self.list.header().setSectionsClickable(True)
+        self.list.header().setSortIndicator(0, Qt.SortOrder.AscendingOrder)
+        self.list.header().setSortIndicatorShown(True)
+        self.list.header().sortIndicatorChanged.connect(self.list.sortItems)
+        self.list.itemChanged.connect(self._switched)
+        self.list.itemSelectionChanged.connect(self._paint)
         self.status = QLabel("Open a picture that was located, or any picture to place it by points of your own.")
         self.status.setWordWrap(True)
         self.buttons: dict[str, QPushButton] = {}
@@ -120,9 +131,9 @@ class MatchDock(QDockWidget):
         row.addStretch(1)
         self.buttons["Add points"].setCheckable(True)
         sides = QSplitter(Qt.Orientation.Horizontal)
-        for side in (self.view, self.canvas, self.table):
+        for side in (self.view, self.canvas, self.list):
             sides.addWidget(side)
-        self.table.setMinimumWidth(310)
+        self.list.setMinimumWidth(310)
         sides.setSizes([400, 400, 310])
         body = QWidget()
         column = QVBoxLayout(body)
@@ -200,17 +211,13 @@ class MatchDock(QDockWidget):
 
     def _renew(self, matches: list[Match]) -> None:
         """Take other points."""
-        self.matches, self.order, self._clicked = list(matches), list(range(len(matches))), {}
+        self.matches, self._clicked = list(matches), {}
         for side in (self.view, self.canvas):
             side.renew(len(matches))
         self._filling = True
-        self.table.setRowCount(len(self.matches))
-        for row in range(len(self.matches)):
-            for column in range(3):
-                item = QTableWidgetItem()
-                item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable | Qt.ItemFlag.ItemIsUserCheckable)
-                self.table.setItem(row, column, item)
-        self._filling = False
+        self.rows = [_Row() for _ in matches]
+        self.list.clear()
+        self.list.addTopLevelItems(self.rows)
         self.refit()
 
     def _zoom(self) -> None:
@@ -259,13 +266,13 @@ class MatchDock(QDockWidget):
         if len(self._clicked) == 2:
             self.remember()
             self._renew([*self.matches, Match(*self._clicked["picture"], *self._clicked["map"])])
-            self.table.selectRow(len(self.matches) - 1)
+            self.list.setCurrentItem(self.rows[-1])
         else:
             self.status.setText(f"Now click the same spot on the {other}.")
 
     def chosen(self) -> set[int]:
         """Return the points that are selected in the list."""
-        return {self.order[index.row()] for index in self.table.selectedIndexes()}
+        return {number for number, row in enumerate(self.rows) if row.isSelected()}
 
     def delete_chosen(self) -> None:
         """Delete the points that are selected in the list."""
@@ -282,22 +289,11 @@ class MatchDock(QDockWidget):
 
     def _switched(self, item: Any) -> None:
         """Switch a point on or off, as its row was ticked."""
-        if not self._filling and item.column() == 0:
-            number = self.order[item.row()]
+        if not self._filling:
+            number = self.rows.index(item)
             self.remember()
-            self.matches[number] = replace(self.matches[number], on=item.checkState() == Qt.CheckState.Checked)
+            self.matches[number] = replace(self.matches[number], on=item.checkState(0) == Qt.CheckState.Checked)
             self.refit()
-
-    def sort(self, column: int, order: Any) -> None:
-        """Sort the list by number, residual or pixel."""
-        chosen, descending = self.chosen(), order == Qt.SortOrder.DescendingOrder
-        keys = (lambda k: k, lambda k: self.apart[k], lambda k: (self.matches[k].column, self.matches[k].row))
-        self.order = sorted(range(len(self.matches)), key=keys[column], reverse=descending)
-        self.table.clearSelection()
-        self.refit()
-        for row, number in enumerate(self.order):
-            for cell in range(3 if number in chosen else 0):
-                self.table.item(row, cell).setSelected(True)
 
     # --- showing ------------------------------------------------------------------------------------------------------
 
@@ -306,14 +302,14 @@ class MatchDock(QDockWidget):
         self.found = fit(self.matches)
         self.apart = self._residuals()
         unit = "m" if self._measure() is not None else "map units"
-        self.table.setHorizontalHeaderLabels(["Point", f"Residual ({unit})", "Pixel"])
+        self.list.setHeaderLabels(["Point", f"Residual ({unit})", "Pixel"])
         self._filling = True
-        for row, number in enumerate(self.order):
-            match, apart = self.matches[number], self.apart[number]
-            self.table.item(row, 0).setCheckState(Qt.CheckState.Checked if match.on else Qt.CheckState.Unchecked)
+        for number, (row, match, apart) in enumerate(zip(self.rows, self.matches, self.apart)):  # noqa: B905
+            row.keys = (number, apart, (match.column, match.row))
+            row.setCheckState(0, Qt.CheckState.Checked if match.on else Qt.CheckState.Unchecked)
             residual = f"{apart:.2f}" if math.isfinite(apart) else ""
             for column, text in enumerate((str(number + 1), residual, f"{match.column:.0f}, {match.row:.0f}")):
-                self.table.item(row, column).setText(text)
+                row.setText(column, text)
         self._filling = False
         self._describe()
         self._paint()

@@ -12,8 +12,8 @@ from qgis.PyQt.QtWidgets import (
     QDialogButtonBox,
     QHeaderView,
     QLabel,
-    QTableWidget,
-    QTableWidgetItem,
+    QTreeWidget,
+    QTreeWidgetItem,
     QVBoxLayout,
 )
 from qgis.utils import iface
@@ -41,19 +41,16 @@ class PlacesDialog(QDialog):
         self.algorithm, self.finding = algorithm, finding
         self.places = list_places(finding.location)
         self.markers = [_mark(place) for place in self.places]
-        self.table = QTableWidget(len(self.places), len(_COLUMNS))
-        self.table.setHorizontalHeaderLabels(_COLUMNS)
-        self.table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
-        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
-        self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
-        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
-        for row, place in enumerate(self.places):
+        self.list = QTreeWidget()
+        self.list.setHeaderLabels(_COLUMNS)
+        self.list.setRootIsDecorated(False)
+        self.list.header().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
+        for place in self.places:
             away = f"{_measure(self.places[0], place) / 1000:.1f} km"
-            texts = (f"{place.lat:.5f}, {place.lon:.5f}", place.map, away, _compare(self.places[0], place))
-            for column, text in enumerate(texts):
-                self.table.setItem(row, column, QTableWidgetItem(text))
-        self.table.itemSelectionChanged.connect(self._look)
-        self.table.doubleClicked.connect(self.choose)
+            texts = [f"{place.lat:.5f}, {place.lon:.5f}", place.map, away, _compare(self.places[0], place)]
+            self.list.addTopLevelItem(QTreeWidgetItem(texts))
+        self.list.currentItemChanged.connect(self._look)
+        self.list.doubleClicked.connect(self.choose)
         advice = QLabel(
             f"{finding.location['reason']}\nSelect a place to see it on the map; have the picture located where you "
             "know it is. Where that does not decide, mend it by hand."
@@ -64,15 +61,18 @@ class PlacesDialog(QDialog):
         self.button.clicked.connect(self.choose)
         buttons.rejected.connect(self.reject)
         column = QVBoxLayout(self)
-        for widget in (advice, self.table, buttons):
+        for widget in (advice, self.list, buttons):
             column.addWidget(widget)
         self.resize(680, 320)
         self.finished.connect(self._clear)
-        self.table.selectRow(0)
+        self.list.setCurrentItem(self.list.topLevelItem(0))
+
+    def _chosen(self) -> Place:
+        return self.places[self.list.indexOfTopLevelItem(self.list.currentItem())]
 
     def _look(self) -> None:
         """Show the selected place, as much around it as the picture covers."""
-        chosen = self.places[max(self.table.currentRow(), 0)]
+        chosen = self._chosen()
         for place, marker in zip(self.places, self.markers):  # noqa: B905 (as long as each other)
             marker.setColor(QColor("#e4572e" if place is chosen else "#1f6fb4"))
         corners = self.finding.location["footprint_lonlat"] or [(-0.01, -0.01), (0.01, 0.01)]
@@ -81,7 +81,7 @@ class PlacesDialog(QDialog):
 
     def choose(self) -> None:
         """Open the dialog again, to search near the selected place alone."""
-        chosen = self.places[max(self.table.currentRow(), 0)]
+        chosen = self._chosen()
         others = [_measure(chosen, place) for place in self.places if place is not chosen]
         near = {
             "NEAR": f"{chosen.lon!r},{chosen.lat!r} [{LONLAT}]",

@@ -25,10 +25,6 @@ class RoadgeoProvider(QgsProcessingProvider):
         """Heading in the toolbox and in the settings."""
         return "roadgeo"
 
-    def longName(self) -> str:
-        """Name in full."""
-        return "roadgeo: locate images by their roads"
-
     def icon(self) -> Any:
         """Crossroads under a pin."""
         return QIcon(str(Path(__file__).parent / "icon.png"))
