@@ -80,7 +80,7 @@ def unknown_names(folder):
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("qgis.PyQt."):
                 module = importlib.import_module(node.module.replace("qgis.PyQt", "PyQt6"))
-                known |= {one.asname or one.name: getattr(module, one.name, None) for one in node.names}
+                known |= {name.asname or name.name: getattr(module, name.name, None) for name in node.names}
         wrong += [f"{path.name}: {name}" for name, found in known.items() if found is None]
         for node in ast.walk(tree):
             words, inner = [], node
