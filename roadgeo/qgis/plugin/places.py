@@ -68,7 +68,7 @@ class PlacesDialog(QDialog):
         self.list.setCurrentItem(self.list.topLevelItem(0))
 
     def _chosen(self) -> Place:
-        return self.places[self.list.indexOfTopLevelItem(self.list.currentItem())]
+        return self.places[int(self.list.indexOfTopLevelItem(self.list.currentItem()))]
 
     def _look(self) -> None:
         """Show the selected place, as much around it as the picture covers."""
