@@ -5,21 +5,23 @@ from __future__ import annotations
 import html
 import zipfile
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.antimeridian import cut_ring, unwrap_ring
-from roadgeo.geometry.warping import MapGrid
+from roadgeo.geometry.warping import MapGrid, cover, warp
+from roadgeo.outputs.drawing.layers import rgb
+from roadgeo.outputs.drawing.views import mask_picture
+from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.subject import Subject
 
 __all__ = ["write_kmz"]
 
-#: Pixels of the picture, and the colour (red, green, blue) of a mask's roads.
-_PIXELS, _ROAD = 4_000_000, (228, 87, 46)
+#: Pixels of the picture, and the longer side of what it is drawn from.
+_PIXELS, _SIDE = 4_000_000, 2500
+
 #: 11 km from a pole a picture in degrees is as wide as it is deformed.
 _MAX_LATITUDE = 89.9
 
@@ -30,52 +32,27 @@ def write_kmz(path: Path, subject: Subject) -> None:
         raise OutputError(
             f"{subject.location.query}: so near a pole there is no picture in degrees; leave out --also kmz"
         )
-    with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
-        overlay, grid = _draw_in_degrees(subject, Path(folder))
+    overlay, grid = _draw_in_degrees(subject)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("doc.kml", _kml(subject, grid))
         archive.writestr("overlay.png", overlay, zipfile.ZIP_STORED)
 
 
-def _draw_in_degrees(subject: Subject, folder: Path) -> tuple[bytes, MapGrid]:
+def _draw_in_degrees(subject: Subject) -> tuple[bytes, MapGrid]:
     """Draw the picture, or the mask's roads, in degrees around its own longitude: PNG and grid."""
-    import rasterio
-
-    from roadgeo.outputs.orthophoto import ImageOptions, warp_image
-
-    source = subject.picture
-    if subject.photo is None:
-        source = folder / "mask.png"
-        drawn = np.zeros((*subject.mask.shape, 4), np.uint8)
-        drawn[subject.mask.roads] = (*_ROAD[::-1], 255)
-        source.write_bytes(_png(drawn))
+    photo, place = subject.photo, subject.place
+    image = mask_picture(subject.mask, rgb("query"), _SIDE) if photo is None else read_preview(photo, _SIDE)
+    size = image.shape[1], image.shape[0]
+    to_crs = subject.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
     middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
-    warped = folder / "degrees.tif"
-    options = ImageOptions(crs, resampling="bilinear", max_pixels=_PIXELS, compression="zstd")
-    grid = warp_image(source, warped, subject.place, subject.homography, {}, options)
-    with rasterio.open(warped) as raster:
-        bands, known = raster.read(), raster.dataset_mask()
-        colors = bands[: raster.count - 1] if raster.dtypes[0] in {"uint8", "uint16"} else bands
-    colors = _to_bytes(colors[[0, 0, 0] if len(colors) < 3 else [0, 1, 2]], known)
-    picture = np.concatenate([colors[::-1], known[None]]).transpose(1, 2, 0)
-    return _png(np.ascontiguousarray(picture)), grid
-
-
-def _png(picture: AnyArray) -> bytes:
-    encoded, content = cv2.imencode(".png", picture)
+    _, to_target, to_place = choose_target(place, ImageOptions(crs))
+    grid = cover(size, to_crs, None, _PIXELS, to_target)
+    warped = warp(image, to_crs, grid, to_place, cv2.INTER_LINEAR, place.lens(size))
+    encoded, content = cv2.imencode(".png", cv2.cvtColor(warped, cv2.COLOR_RGBA2BGRA))
     if not encoded:
         raise OutputError("OpenCV did not encode the picture of the KMZ; use a smaller one")
-    return content.tobytes()
-
-
-def _to_bytes(colors: AnyArray, known: AnyArray) -> AnyArray:
-    """Stretch deeper values to 8 bit, between the darkest and the brightest hundredth."""
-    if colors.dtype == np.uint8:
-        return np.asarray(colors)
-    low, high = np.percentile(colors[:, known > 0], (1, 99))
-    stretched = (np.nan_to_num(colors.astype(float)) - low) * (255.0 / max(float(high - low), 1e-9))
-    return np.asarray(np.clip(stretched, 0, 255), np.uint8)
+    return content.tobytes(), grid
 
 
 _KML_POLYGON = """<Polygon><tessellate>1</tessellate>

@@ -1,5 +1,4 @@
 import csv
-import errno
 import json
 import shutil
 import xml.etree.ElementTree as ET
@@ -15,7 +14,6 @@ import rasterio
 from outputs.test_location_files import located, road_mask
 from worlds.turned import save_turned
 
-from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Location
 from roadgeo.outputs.kmz import write_kmz
@@ -24,7 +22,6 @@ from roadgeo.outputs.outlines import write_geojson
 from roadgeo.outputs.paths import OutputPaths, output_paths
 from roadgeo.outputs.registry import ALSO
 from roadgeo.outputs.subject import Subject
-from roadgeo.storage.files import replacing
 from roadgeo.storage.rasters import open_raster
 
 
@@ -219,21 +216,6 @@ def test_the_kmz_lies_where_the_picture_does(written: OutputPaths) -> None:
     lat = north - (rows.mean() + 0.5) / picture.shape[0] * (north - south)
     middle = pyproj.Transformer.from_crs(32629, 4326, always_xy=True).transform(*located().footprint.mean(axis=0))
     np.testing.assert_allclose((lon, lat), middle, atol=1e-4)
-
-
-def test_a_full_disk_is_told_of_where_a_kmz_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """OpenCV's own writing told nothing, and another error followed."""
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    subject = Subject(located(), road_mask(), output_paths(tmp_path, "a"))
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with (
-        pytest.raises(OutputError, match=r"cannot write .*a.kmz: no space left"),
-        replacing(tmp_path / "a.kmz") as path,
-    ):
-        write_kmz(path, subject)
 
 
 def astride(tmp_path: Path) -> Subject:

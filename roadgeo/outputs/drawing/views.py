@@ -261,7 +261,8 @@ def _tinted(opacity: AnyArray, color: Color, side: int) -> AnyArray:
     size = [max(round(length * factor), 1) for length in opacity.shape[::-1]]
     image = np.empty((size[1], size[0], 4), np.uint8)
     image[..., :3] = color
-    image[..., 3] = np.bitwise_and(cv2.resize(opacity, size, interpolation=cv2.INTER_AREA), 0xF0)
+    level = np.right_shift(cv2.resize(opacity, size, interpolation=cv2.INTER_AREA), 4)
+    image[..., 3] = 17 * level
     return image
 
 
