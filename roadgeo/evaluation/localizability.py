@@ -1,6 +1,6 @@
 """Where on a map would masks be located? A map of the odds, learnt from masks tried at random places of it.
 
-The odds depend on how many intersections a mask shows, how many of them stand clear of others (those of interchanges
+The odds depend on how many intersections a mask shows, how many of them stand clear of others (at interchanges they
 merge), how much their streets differ in direction (a lattice has few directions and looks alike everywhere), and how
 well this reference, this camera and this quality of masks go together. All but the last is known at every place of the
 map; the weights are fitted to the trials by logistic regression.
@@ -126,7 +126,7 @@ class LocalizabilityMap:
     classes : (R, C) uint8
         `LOCATED`, `AMBIGUOUS`, `TOO_FEW`, or `UNKNOWN` off the map.
     probability : (R, C) float32
-        Of being located, as fitted; NaN off the map.
+        Probability of being located, as fitted; NaN off the map.
     threshold : float
         Probability from which cells are marked as located; infinite where the trials support none.
     """

@@ -36,7 +36,7 @@ class NoiseModel:
     warp_px : float
         Standard deviation of a smooth random displacement.
     raggedness : float
-        Of the road edges; 0.5 tears thin roads apart.
+        How ragged road edges are; 0.5 tears thin roads apart.
     distortion : range
         Radial displacement at the frame's corner by the lens, as a share of the half diagonal, either way.
     """
@@ -93,7 +93,7 @@ def draw_mask(
     Parameters
     ----------
     road_width : range
-        Of a street, in metres, so that it looks narrower farther off; or in pixels, the same everywhere in the frame.
+        Width of a street, in metres, so that it looks narrower farther off; or in pixels, the same in all of the frame.
 
     Returns
     -------

@@ -61,7 +61,7 @@ class Score:
     right : bool
         Located within the radius of its place.
     center_m : float
-        Distance of the middle of the frame from its place; NaN where no place is reported or there is none.
+        Distance of the middle of the frame from its place; NaN where no place is reported, or the mask has no place.
     corners_m, sigma_m : tuple of 4 floats
         Errors of the corners TL, TR, BR, BL, and the standard deviations (of each coordinate) reported for them.
     log10_odds : float
@@ -181,12 +181,12 @@ def _spread(values: Iterable[float]) -> Spread:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a group of masks fared. Errors are those of the right ones, seconds those of all.
+    """How a group of masks fared. Errors are of the right ones, seconds of all.
 
     Attributes
     ----------
     refused : Share
-        Of the masks that have no place on the map, those not located.
+        Share not located among the masks that have no place on the map.
     """
 
     name: str

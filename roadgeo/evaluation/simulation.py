@@ -48,7 +48,7 @@ class ViewOptions:
     gsd_m : range
         Metres per pixel across the optical axis at the frame's centre; drawn log-uniformly.
     tilt_deg : range
-        Of the optical axis from the vertical, towards any direction.
+        Angle of the optical axis from the vertical, towards any direction.
     heading_deg : range
         Direction of the image's up at its centre, clockwise from north.
     focal_px : float or None

@@ -122,13 +122,13 @@ class Survey:
 
 
 def write_survey(
-    survey: Survey, out_dir: Path, told: Mapping[str, Any] | None = None
+    survey: Survey, out_dir: Path, further: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, Any], list[Path]]:
     """Make the map, and write it as GeoTIFF with a style for QGIS, as picture and in figures.
 
     Parameters
     ----------
-    told : mapping, optional
+    further : mapping, optional
         Further plain values for the figures: version, command and so on.
 
     Returns
@@ -139,7 +139,7 @@ def write_survey(
     Raises
     ------
     OutputError
-        A file cannot be written, or the trials kept in the folder are those of another survey.
+        A file cannot be written, or the trials kept in the folder belong to another survey.
     """
     network = read_network(survey.reference)
     found = survey.learn(network)
@@ -151,7 +151,7 @@ def write_survey(
     write_text(files[1], to_qml())
     with replacing(files[2]) as temporary:
         write_png(temporary, draw_localizability(network, found, title))
-    summary = {**survey.summarize(found), "settings": survey.settings, **(told or {})}
+    summary = {**survey.summarize(found), "settings": survey.settings, **(further or {})}
     write_text(files[3], json.dumps(summary, indent=1) + "\n")
     return summary, files
 

@@ -91,7 +91,7 @@ def count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
 
 
 def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
-    """Read the roads to draw masks from: a reference's own, or those of a file, where the reference covers them.
+    """Read the roads to draw masks from: a reference's own, or a file's, where the reference covers them.
 
     Raises
     ------

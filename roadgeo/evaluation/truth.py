@@ -86,8 +86,10 @@ class Truth:
         return Homography(self.homography)(np.array(self.size) / 2)
 
 
-def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth], told: Mapping[str, Any] | None = None) -> None:
-    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder; `told` holds further values for the JSON.
+def write_truth(
+    folder: str | os.PathLike[str], truths: Sequence[Truth], further: Mapping[str, Any] | None = None
+) -> None:
+    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder; `further` holds values for the JSON.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth], told: M
     """
     target = Path(folder)
     write_text(target / "truth.csv", _to_csv(truths))
-    write_text(target / "truth.json", _to_json(truths, told or {}))
+    write_text(target / "truth.json", _to_json(truths, further or {}))
     if truths:
         write_layers(target / "footprints.gpkg", [_to_layer(truths)])
 
@@ -107,7 +109,7 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
     Parameters
     ----------
     crs : str, optional
-        Of a table that names none.
+        CRS of a table that names none.
 
     Raises
     ------
@@ -172,9 +174,10 @@ def truth_from_record(record: dict[str, Any], crs: str | None = None) -> Truth:
     )
 
 
-def _to_json(truths: Sequence[Truth], told: Mapping[str, Any]) -> str:
+def _to_json(truths: Sequence[Truth], further: Mapping[str, Any]) -> str:
     return (
-        json.dumps({"schema": SCHEMA, **told, "queries": [truth_to_record(truth) for truth in truths]}, indent=1) + "\n"
+        json.dumps({"schema": SCHEMA, **further, "queries": [truth_to_record(truth) for truth in truths]}, indent=1)
+        + "\n"
     )
 
 

@@ -87,15 +87,15 @@ def write_points(path: Path, subject: Subject) -> None:
 
 
 def write_match_points(path: Path, subject: Subject) -> None:
-    """Write the matched intersections as measured, for the QGIS Georeferencer; those of `write_points` are exact."""
+    """Write the matched intersections as measured, for the QGIS Georeferencer; `write_points` writes exact points."""
     wkt = known_crs(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
-    for one in subject.matches():
-        pixels = np.array([[one.column, one.row], [one.fitted_column, one.fitted_row]])
+    for match in subject.matches():
+        pixels = np.array([[match.column, match.row], [match.fitted_column, match.fitted_row]])
         (column, row), (fitted_column, fitted_row) = subject.stored(pixels).tolist()
         # QGIS's residuals are in pixels of the source, from the point to where the transformation has it.
         dx, dy = fitted_column - column, row - fitted_row
-        lines.append(f"{one.x!r},{one.y!r},{column!r},{-row!r},1,{dx!r},{dy!r},{math.hypot(dx, dy)!r}")
+        lines.append(f"{match.x!r},{match.y!r},{column!r},{-row!r},1,{dx!r},{dy!r},{math.hypot(dx, dy)!r}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -106,13 +106,13 @@ def write_matches(path: Path, subject: Subject) -> None:
     `crs`; `dx_m`, `dy_m` lead from where the homography puts the picture's intersection to the map's.
     """
     matches = subject.matches()
-    lonlat = to_lonlat(subject.place.crs, np.array([(one.x, one.y) for one in matches], float).reshape(-1, 2))
+    lonlat = to_lonlat(subject.place.crs, np.array([(match.x, match.y) for match in matches], float).reshape(-1, 2))
     with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["id", "column", "row", "x", "y", "lon", "lat", "dx_m", "dy_m", "residual_m", "crs"])
-        for number, (one, (lon, lat)) in enumerate(zip(matches, lonlat.tolist(), strict=True), 1):
-            where = [one.column, one.row, one.x, one.y, f"{lon:.9f}", f"{lat:.9f}"]
-            apart = [one.dx_m, one.dy_m, float(np.hypot(one.dx_m, one.dy_m))]
+        for number, (match, (lon, lat)) in enumerate(zip(matches, lonlat.tolist(), strict=True), 1):
+            where = [match.column, match.row, match.x, match.y, f"{lon:.9f}", f"{lat:.9f}"]
+            apart = [match.dx_m, match.dy_m, float(np.hypot(match.dx_m, match.dy_m))]
             table.writerow([number, *where, *apart, subject.place.crs])
 
 

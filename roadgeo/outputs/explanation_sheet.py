@@ -56,8 +56,8 @@ def write_explanation(path: Path, subject: Subject) -> None:
     explained = _explained(subject).to_dict()
     query, reason, command = (str(explained[name]) for name in ("query", "reason", "command"))
     explained |= {"query": bare_name(query), "reason": without_folders(reason, query), "command": bare_command(command)}
-    told = json.dumps(explained, indent=2, allow_nan=False)
-    path.write_text(told + "\n", encoding="utf-8", newline="\n")
+    text = json.dumps(explained, indent=2, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
 def write_explanation_picture(path: Path, subject: Subject) -> None:
@@ -86,8 +86,8 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
         Red, green, blue. Left the mask, its traced roads and intersections, and below how many candidates each stage
         left; right the best places: the mask's roads on the map's, teal where they agree and orange where not.
     """
-    told = explanation.stories
-    story = next((one for one in told if one.reference == index.name), told[0])
+    stories = explanation.stories
+    story = next((each for each in stories if each.reference == index.name), stories[0])
     left = np.vstack([_draw_seen(explanation, mask, index), _draw_funnel(story)])
     right = np.vstack([_draw_places(story.places, explanation.scene, index), _draw_notes(story)])
     height = max(len(left), len(right))

@@ -67,10 +67,10 @@ def _kml(subject: Subject, grid: MapGrid) -> str:
     rings = [" ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in ring) for ring in cut_ring(subject.outline())]
     polygons = "\n".join(map(_KML_POLYGON.format, rings))
     name = html.escape(subject.paths.stem)
-    said = html.escape(f"{subject.location.reason}. {subject.location.attribution}".strip())
+    text = html.escape(f"{subject.location.reason}. {subject.location.attribution}".strip())
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2">
-<Document><name>{name}</name><description>{said}</description>
+<Document><name>{name}</name><description>{text}</description>
 <Style id="footprint">
 <LineStyle><color>ffb46f1f</color><width>3</width></LineStyle><PolyStyle><fill>0</fill></PolyStyle>
 </Style>

@@ -34,7 +34,7 @@ class OutputOptions:
     image : ImageOptions
         How the picture, or without one the mask, is drawn on the map; masks always with the nearest value.
     products : tuple of str
-        Further outputs by name: those of `outputs.registry` and of plugins.
+        Further outputs by name: in `outputs.registry`, or a plugin's.
     """
 
     image: ImageOptions = field(default_factory=ImageOptions)
@@ -69,8 +69,10 @@ def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_cam
         There is no such output.
     """
     wanted = [*ALWAYS, *find_outputs(names)]
-    wanted = [one for one in wanted if (located or not one.needs_place) and (has_camera or not one.needs_camera)]
-    return [one for one in wanted if not (one is STYLE and has_photo)]
+    wanted = [
+        output for output in wanted if (located or not output.needs_place) and (has_camera or not output.needs_camera)
+    ]
+    return [output for output in wanted if not (output is STYLE and has_photo)]
 
 
 def write_location(
@@ -151,8 +153,8 @@ def _write(output: Output, path: Path, subject: Subject, files: ExitStack) -> st
         with suppress(Exception):
             own.__exit__(type(error), error, error.__traceback__)
         whose = f"the output {output.name!r} of {output.write.__module__}"
-        said = str(error) if isinstance(error, RoadgeoError) else f"{type(error).__name__}: {error}; inform its makers"
-        return f"{subject.location.query}: {whose} failed: {' '.join(said.split())}; all else is written"
+        text = str(error) if isinstance(error, RoadgeoError) else f"{type(error).__name__}: {error}; inform its makers"
+        return f"{subject.location.query}: {whose} failed: {' '.join(text.split())}; all else is written"
     files.enter_context(own)
     return ""
 
@@ -166,7 +168,7 @@ def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) ->
     """List outdated files of an earlier run, which show a place or a camera."""
     outputs = dict.fromkeys([*REGISTRY.values(), *find_outputs(names)])
     if subject.location.located:
-        outputs = dict.fromkeys(one for one in outputs if one.needs_camera and subject.location.camera is None)
+        outputs = dict.fromkeys(output for output in outputs if output.needs_camera and subject.location.camera is None)
     return [subject.paths.of(output, subject.picture.name) for output in outputs if output not in written]
 
 

@@ -128,8 +128,8 @@ def _corner_layer(place: Placement, location: Location) -> Layer:
         "cov_xy_m2": blocks[:, 0, 1],
         "var_y_m2": blocks[:, 1, 1],
     }
-    told = "Corners of the frame; how far each may be off, and the covariance of its x and y"
-    return Layer("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, told)
+    summary = "Corners of the frame; how far each may be off, and the covariance of its x and y"
+    return Layer("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, summary)
 
 
 def _alternative_layer(place: Placement, location: Location) -> Layer:
@@ -138,12 +138,12 @@ def _alternative_layer(place: Placement, location: Location) -> Layer:
     return Layer(
         "alternatives",
         "POINT",
-        np.array([(one.x, one.y) for one in others], float).reshape(-1, 2),
+        np.array([(other.x, other.y) for other in others], float).reshape(-1, 2),
         {
             "rank": np.arange(2, 2 + len(others)),
-            "log10_odds": np.array([one.log10_odds for one in others], float),
-            "lon": np.array([one.lon for one in others], float),
-            "lat": np.array([one.lat for one in others], float),
+            "log10_odds": np.array([other.log10_odds for other in others], float),
+            "lon": np.array([other.lon for other in others], float),
+            "lat": np.array([other.lat for other in others], float),
         },
         place.crs,
         _ALTERNATIVES_STYLE,

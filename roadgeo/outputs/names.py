@@ -19,12 +19,12 @@ __all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "table_cel
 
 _LOG = logging.getLogger(__name__)
 
-#: The folders of a path from the root on, of Windows too; not those of a URL.
+#: The folders of a path from the root on, of Windows too; a URL's are kept.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[/\\]+(?:[^/\\\s:;,'\"]+[/\\])+")
 
 
 def bare_name(path: str) -> str:
-    """Return a file's name without its folders, those of Windows too."""
+    """Return a file's name without its folders, on Windows too."""
     return re.split(r"[/\\]", path.rstrip("/\\"))[-1] or path
 
 
@@ -43,8 +43,8 @@ def bare_names(paths: Sequence[str]) -> list[str]:
 def name_for_odm(name: str) -> str:
     """Return a picture's name for OpenDroneMap's tables, and warn of spaces, which part columns there."""
     if re.search(r"\s", name):
-        told = "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
-        _LOG.warning(told, visible(name))
+        text = "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
+        _LOG.warning(text, visible(name))
     return visible(name)
 
 

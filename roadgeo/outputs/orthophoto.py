@@ -81,7 +81,7 @@ class ImageOptions:
     max_pixels : int
         A larger result is made coarser.
     compression : {"deflate", "zstd", "jpeg", "webp"}
-        Of the file; the last two are lossy, for pictures of 8 bits and one or three bands.
+        How the file is compressed; the last two are lossy, for pictures of 8 bits and one or three bands.
     """
 
     crs: str | None = None
@@ -132,7 +132,7 @@ def image_homography(
     """
     width, height = raster_size(path)
     factors = np.array([mask_size[0] / width, mask_size[1] / height])
-    # The sides of a reduced picture are rounded, so a pixel's worth of difference is none.
+    # The sides of a reduced picture are rounded, so they may differ by a pixel's worth.
     if abs(factors[0] / factors[1] - 1) > 1.5 / min(*mask_size, width, height):
         orientation = read_orientation(path)
         remedy = "crop or pad the picture as the mask was made"
@@ -276,7 +276,7 @@ class _Plan:
 
     @property
     def colors(self) -> list[ColorInterp]:
-        """Of the result's bands."""
+        """Colours of the result's bands."""
         if self.palette is not None:
             kept = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
         else:
@@ -285,7 +285,7 @@ class _Plan:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of all bands."""
+        """Type of all bands."""
         name: str = self.picture.dtypes[0]
         return np.dtype(name)
 
@@ -396,7 +396,7 @@ def _optimize(drawn: Path, target: str | os.PathLike[str], options: ImageOptions
 def _blocks(plan: _Plan) -> Iterator[tuple[int, int, AnyArray]]:
     """Draw block after block: column, row, and (bands, rows, columns); transparent ones are left out.
 
-    All reading is done here, for GDAL's settings are those of a thread; a few blocks are drawn at a time.
+    All reading is done here, for GDAL's settings belong to a thread; a few blocks are drawn at a time.
     """
     n_threads = os.cpu_count() or 1
     with ThreadPoolExecutor(n_threads) as pool:
@@ -459,7 +459,7 @@ def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: BoolArray)
 
 def _source_window(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> Window:
     """Return the part of the picture that a block needs."""
-    ends = [cv2.minMaxLoc(one, inside.view(np.uint8))[:2] for one in pixels]
+    ends = [cv2.minMaxLoc(axis, inside.view(np.uint8))[:2] for axis in pixels]
     left, top = (max(math.floor(low) - _REACH, 0) for low, _ in ends)
     right, bottom = (min(math.ceil(high) + _REACH, side) for (_, high), side in zip(ends, plan.size, strict=True))
     return Window(left, top, right - left, bottom - top)

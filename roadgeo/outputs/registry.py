@@ -33,7 +33,7 @@ __all__ = [
     "result_endings",
 ]
 
-#: Endings of the names of further results, before their suffixes: those of `vectorize` and of `evaluate --map`.
+#: Endings of the names of further results, before their suffixes: of `vectorize` and `evaluate --map`.
 VECTORIZED, LOCALIZABILITY = "_vectorized", "_localizability"
 
 
@@ -44,7 +44,7 @@ class Output:
     Attributes
     ----------
     name : str
-        Name on the command line; a plugin's is that of its entry point.
+        Name on the command line; a plugin's is its entry point's.
     ending : str
         End of the file's name, after the result's stem; "{picture}" stands for the picture's own name instead.
     write : callable
@@ -182,7 +182,7 @@ def find_outputs(names: Iterable[str]) -> list[Output]:
     Raises
     ------
     PluginError
-        There is none of that name, or what is offered under it is no `Output`.
+        No output has that name, or what is offered under it is not an `Output`.
     """
     return [REGISTRY[name] if name in REGISTRY else _load(name) for name in dict.fromkeys(names)]
 

@@ -59,7 +59,7 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class Subject:
-    """The input of the outputs. Members that need a place raise an `OutputError` where there is none.
+    """The input of the outputs. Members that need a place raise an `OutputError` without it.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Subject:
         Raises
         ------
         OutputError
-            There is none at all.
+            No map is given.
         """
         if not self.indexes:
             raise OutputError(f"{self.location.query}: no map is given to draw it on")

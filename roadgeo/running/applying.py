@@ -114,10 +114,10 @@ def _require_one_place(homography: FloatArray, footprint: FloatArray, size: tupl
         raise ValueError(f"a frame of {side:g} m")
 
 
-def _crs(told: str) -> str:
+def _crs(name: str) -> str:
     """Return a CRS as every library reads it."""
     try:
-        return name_crs(told)
+        return name_crs(name)
     except CrsError as error:
         raise ValueError(str(error)) from error
 
@@ -127,17 +127,17 @@ def _place(document: dict[str, Any]) -> Place:
     return Place(x, y, lon, lat, float(document.get("log10_odds") or 0.0))
 
 
-def _camera(told: dict[str, Any]) -> Camera:
+def _camera(camera: dict[str, Any]) -> Camera:
     names = ("x", "y", "lon", "lat", "height_m", "heading_deg", "pitch_deg", "roll_deg", "focal_px")
-    x, y, lon, lat, height, heading, pitch, roll, focal = _numbers(told, names)
-    covariance, rotation = _array(told["covariance"], (6, 6)), _array(told["rotation"], (3, 3))
-    lens = (focal, float(told["sigma"]["focal_px"]), str(told["source"]))
-    ground = (told.get("ground_m"), told.get("ground_spread_m"))
+    x, y, lon, lat, height, heading, pitch, roll, focal = _numbers(camera, names)
+    covariance, rotation = _array(camera["covariance"], (6, 6)), _array(camera["rotation"], (3, 3))
+    lens = (focal, float(camera["sigma"]["focal_px"]), str(camera["source"]))
+    ground = (camera.get("ground_m"), camera.get("ground_spread_m"))
     return Camera(x, y, lon, lat, height, heading, pitch, roll, *lens, covariance, rotation, *ground)
 
 
-def _numbers(told: dict[str, Any], names: Sequence[str]) -> list[float]:
-    return [float(number) for number in _array([told[name] for name in names], (len(names),))]
+def _numbers(document: dict[str, Any], names: Sequence[str]) -> list[float]:
+    return [float(number) for number in _array([document[name] for name in names], (len(names),))]
 
 
 def _array(values: Any, shape: tuple[int, ...]) -> FloatArray:
@@ -177,7 +177,7 @@ def apply_location(
         A file cannot be written, or an output needs values that a location does not hold.
     """
     outputs = [FOOTPRINT, *find_outputs(products)]
-    unfit = [one.name for one in outputs if one in (MATCHES, MATCH_POINTS) or not one.needs_place]
+    unfit = [output.name for output in outputs if output in (MATCHES, MATCH_POINTS) or not output.needs_place]
     if unfit:
         raise OutputError(f"{', '.join(unfit)}: shows what a mask was matched by; have `roadgeo locate` write it")
     written: list[Path] = []

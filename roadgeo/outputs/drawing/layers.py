@@ -57,7 +57,7 @@ class Look:
     color : str
         Name in `PALETTE`.
     width_px : float
-        Of lines, and the diameter of dots, on a screen.
+        Width of lines, and diameter of dots, on a screen.
     width_m : float
         Width on the ground, of what is drawn to scale where that can be seen; 0 for the same width at every scale.
     fill : float
@@ -131,7 +131,7 @@ class Ring:
 class Picture:
     """A picture (h, w, 4) uint8, red, green, blue, alpha, stretched to a box.
 
-    Of a page it takes at most `max_bytes`, and is coded `lossless` where it is a drawing.
+    On a page it takes at most `max_bytes`; a drawing is coded `lossless`.
     """
 
     image: AnyArray

@@ -58,7 +58,7 @@ class ViewOptions:
         Ground shown around the footprint at first, and ground whose roads are there to be moved to, in lengths of the
         footprint's longer side.
     max_map_vertices, max_query_vertices : int
-        Of the roads of the map and of the mask.
+        Vertices of the roads of the map, and of the mask.
     max_matches : int
         Those with the largest residuals are listed and drawn.
     picture_px, picture_bytes : int
@@ -155,7 +155,7 @@ class Shown:
         Raises
         ------
         OutputError
-            There is none.
+            The location has no place.
         """
         return self.place or Placement.of(self.location)
 
@@ -247,7 +247,7 @@ def touching(ends: AnyArray, low: FloatArray, high: FloatArray) -> BoolArray:
 
 
 def mask_picture(mask: RoadMask, color: Color, side: int) -> AnyArray:
-    """Draw a mask's roads in a colour, and what was not observed in grey: (h, w, 4) uint8, at most `side` pixels."""
+    """Draw a mask's roads in a colour, and unobserved ground in grey: (h, w, 4) uint8, at most `side` pixels."""
     image = _tinted(mask.roads.view(np.uint8) * np.uint8(255), color, side)
     if mask.observed is not None:
         unseen = cv2.resize((~mask.observed).view(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -299,7 +299,7 @@ def place_layers(subject: Shown, place: Placement, window: Window) -> list[Layer
     crossings = subject.index.plane.to_crs(subject.index.xy)
     crossings = window.place(crossings[wide.holds(crossings)][: options.max_map_vertices // 4])
     corners = window.place(place.footprint)
-    lines = [line for line in (window.place(place.to_crs(one)) for one in subject.lines) if np.isfinite(line).all()]
+    lines = [line for line in (window.place(place.to_crs(road)) for road in subject.lines) if np.isfinite(line).all()]
     layers = [
         Layer("ground", "", [Ring(corners)]),
         *_picture_on_map(subject, place, window),

@@ -48,7 +48,7 @@ class Entry:
 
     @property
     def path(self) -> PurePath:
-        """Of the mask, as it was given."""
+        """Path of the mask, as it was given."""
         return PurePath(str(self.document["query"]))
 
     @property
@@ -81,7 +81,7 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
         The maps that were searched; those on which nothing was found are left out, but for the first.
     """
     counts = Counter(entry.status for entry in entries)
-    said = ", ".join(f"{counts[status]} {words[2:]}" for status, words in STATUS.items() if counts[status])
+    states = ", ".join(f"{counts[status]} {words[2:]}" for status, words in STATUS.items() if counts[status])
     shown = entries[:_MAX_LISTED]
     left_out = len(entries) - len(shown)
     maps = [(index, [entry for entry in shown if entry.document.get("reference") == index.name]) for index in indexes]
@@ -95,7 +95,7 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     named = dict.fromkeys(_credit(index) for index, _ in maps)
     parts = [section("Masks", listed), *others, footer("; ".join(filter(None, named)))]
     title = counted(len(entries), "image")
-    header = f"<h1>{title}</h1><p>{said}</p>"
+    header = f"<h1>{title}</h1><p>{states}</p>"
     return render_page(title, header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
 
 
@@ -133,6 +133,6 @@ def _item(entry: Entry, with_folder: bool) -> str:
             parts.append(f"corners {write_sigma(max(sigma))}")
         if odds is not None:
             parts.append(f"score {odds:.1f}")
-    said = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
+    text = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
-    return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{said}</small></li>"
+    return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{text}</small></li>"

@@ -34,7 +34,7 @@ _SIGN = {"agrees": "✓ agrees", "off": "≠ off", "unknown": "? unknown", "erro
 def write_verification(
     path: Path,
     document: Mapping[str, Any],
-    said: str,
+    sentence: str,
     place: Georeference | None = None,
     corrected: Georeference | None = None,
     index: ReferenceIndex | None = None,
@@ -44,11 +44,11 @@ def write_verification(
     Parameters
     ----------
     document : mapping
-        Of schema roadgeo.verification/1.
-    said : str
+        Result of schema roadgeo.verification/1.
+    sentence : str
         The answer in a sentence.
     place, corrected : Georeference or None
-        What the image says of its place, and what the roads say where that is another.
+        What the image says of its place, and what the roads say if that is another.
     index : ReferenceIndex or None
         The map that it was held against.
 
@@ -65,7 +65,7 @@ def write_verification(
     parts = section("Numbers", table(rows) if rows else "")
     header = (
         f'<h1>{html.escape(name)}</h1><span class="status {_STATUS[verdict]}">{_SIGN[verdict]}</span>'
-        f"<p>{html.escape(said)}</p>"
+        f"<p>{html.escape(sentence)}</p>"
     )
     credit = footer(str(document.get("attribution") or ""))
     write_text(path, render_page(name, header, f"<main>{view}<aside>{parts}{credit}</aside></main>"))
