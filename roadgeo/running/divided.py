@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from roadgeo.errors import RoadgeoError
@@ -64,15 +63,16 @@ def owners(parts: Sequence[str], workers: Sequence[str]) -> dict[str, list[str]]
 
 
 class _Answer(NamedTuple):
-    """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part.
-
-    `seconds`: time that it took, without the time in which it waited for the worker.
-    """
+    """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part."""
 
     location: Location
     places: Sequence[tuple[float, str]]
     parts: Sequence[str]
-    seconds: float
+
+    @property
+    def seconds(self) -> float:
+        """Time of the search alone, without the time in which it waited for the worker, and opened maps."""
+        return self.location.seconds.match + self.location.seconds.refine
 
 
 def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> Iterator[Outcome]:
@@ -200,14 +200,14 @@ class _Searcher:
 
     def __call__(self, query: Query, names: Sequence[str], options: LocateOptions, against: float) -> _Answer:
         """Search parts together; all places are less likely by `against` (log10), for the rest of the map."""
-        started, parts = perf_counter(), [self.parts[name] for name in names]
+        parts = [self.parts[name] for name in names]
         found = search_references(query, parts, options, options.search.time_limit_s)
         found = [_less_likely(result, against) for result in found]
         least = options.min_log10_odds - options.min_margin
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
         fits = [fit for result in found for fit in result.fits if fit.log10_odds >= least]
         places = [(fit.log10_odds, by_path[_path(fit.index)]) for fit in fits]
-        return _Answer(decide(query, found, options), places, names, perf_counter() - started)
+        return _Answer(decide(query, found, options), places, names)
 
 
 def _less_likely(found: Found, against: float) -> Found:

@@ -17,7 +17,7 @@ from worlds.scenes import PLANE, random_lines
 
 from roadgeo.cli import main
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
+from roadgeo.location import Location, Seconds
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 
@@ -146,7 +146,8 @@ class Slow:
         time.sleep(0.3)
         self.limits.append(options.search.time_limit_s)
         future = Future()
-        future.set_result(divided._Answer(Location("q", "not_located", "nothing"), [], parts, 0.05))
+        refused = Location("q", "not_located", "nothing", seconds=Seconds(match=0.04, refine=0.01))
+        future.set_result(divided._Answer(refused, [], parts))
         return future
 
 
