@@ -130,13 +130,27 @@ def _open_as_mask(path: str | AnyArray, reading: ReadOptions) -> Iterator[MaskSo
     """
     with ExitStack() as stack:
         source = None
-        if reading.may_be_mask:
+        if reading.may_be_mask and not (_is_chosen_by_values(reading) and _is_photograph(path)):
             try:
                 source = stack.enter_context(open_mask(path, band=reading.band, threshold=reading.threshold))
             except PhotographError:
                 if reading.segment == "never":
                     raise
         yield source
+
+
+def _is_chosen_by_values(reading: ReadOptions) -> bool:
+    """Whether values decide what a path holds, though a threshold is given."""
+    return reading.segment == "auto" and reading.threshold is not None and reading.band is None
+
+
+def _is_photograph(path: str | AnyArray) -> bool:
+    """Whether the values of a path look like a photograph's."""
+    try:
+        with open_mask(path):
+            return False
+    except MaskError as error:
+        return isinstance(error, PhotographError)
 
 
 def _looks_at(mask: MaskSource) -> Callable[[float], Seen]:

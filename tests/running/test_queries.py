@@ -295,6 +295,14 @@ def test_what_is_seen_is_shown_without_a_map(
     assert np.abs(drawn[far] - 0.8 * image[far]).mean() < 3  # the photograph itself
 
 
+def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> None:
+    reading = ReadOptions(threshold=0.4, segmenters=(model,))
+    assert queries.look_once(str(photo), (0.6, 1.0), reading).probability is not None
+    assert queries.look_once(str(MASK.path), None, reading).probability is None
+    as_mask = replace(reading, threshold=200.0, segment="never")
+    assert queries.look_once(str(photo), None, as_mask).probability is None
+
+
 def test_what_plugins_and_masks_show(
     tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
