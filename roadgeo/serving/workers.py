@@ -130,7 +130,8 @@ class Workers:
         self._lock = threading.Lock()
         self._closed = False
         try:
-            self._all += [_Worker(context, given) for _ in range(count)]
+            for _ in range(count):
+                self._all.append(_Worker(context, given))
             for worker in self._all:
                 worker.wait_until_ready()
                 self._idle.put(worker)

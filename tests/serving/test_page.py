@@ -221,18 +221,10 @@ def test_a_place_is_looked_at_from_all_sides(page, served):
     page.locator("#opacity").fill("30")
     page.uncheck("#show-roads")
     page.check("#show-matches")
-    page.check("#show-swipe")
-    page.focus("#swipe")
-    page.keyboard.press("ArrowRight")
-    expect(page.locator("#swipe")).to_have_attribute("aria-valuenow", "55")
-    assert "55%" in page.evaluate("document.getElementById('over').style.clipPath")
-    page.mouse.move(1280 * 0.55, 400)
-    page.mouse.down()
-    page.mouse.move(900, 400, steps=3)
-    page.mouse.up()
-    expect(page.locator("#swipe")).to_have_attribute("aria-valuenow", "70")
+    look = "import('./page/map.mjs').then(({ theMap }) => [%s])"
+    shown = "theMap().getPaintProperty('photo', 'raster-opacity'), theMap().getLayoutProperty('seen', 'visibility')"
+    assert page.evaluate(look % shown) == [0.3, "none"]
     # A matched crossing tells its residual.
-    page.uncheck("#show-swipe")
     where = page.locator("#photo").get_attribute("src").replace("picture.jpg", "view.json")
     first = page.evaluate("(where) => fetch(where).then((answer) => answer.json())", where)
     page.mouse.click(*on_map(page, first["place"]["matches"][0]["map"]))
@@ -474,7 +466,6 @@ def test_everything_has_a_name_and_can_be_read(page, served, hard):
     wait_for(page, "Located")
     page.click("#help summary")
     page.click("#files-of summary")
-    page.check("#show-swipe")
     require_usable(page)
     give(page, mask, "twins.png")
     wait_for(page, "Two places")
@@ -487,7 +478,6 @@ def test_everything_has_a_name_and_can_be_read(page, served, hard):
         - region "Places that fit"
         - group "On the map":
           - slider "Opacity of the photograph"
-          - checkbox "Swipe"
           - checkbox "Roads seen" [checked]
     """)
 

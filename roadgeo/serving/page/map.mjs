@@ -7,7 +7,7 @@ const EMPTY = { type: "FeatureCollection", features: [] };
 const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
 const collection = (features) => ({ type: "FeatureCollection", features });
 
-let map, over, shown = null;
+let map, shown = null;
 const popup = new maplibre.Popup({ closeButton: false });
 const markers = [];
 
@@ -42,18 +42,25 @@ export function makeMap({ references, basemap, basemap_attribution, max_zoom }) 
     roads.push({ ...line, id: `road-${i}`, paint: { "line-color": "#8c949e", "line-width": width(0.5, 1.4, 14) } });
   });
   const data = { type: "geojson", data: EMPTY };
-  Object.assign(sources, { area: data, outline: data });
-  const common = { attributionControl: false, fadeDuration: 0, maxPitch: 0, dragRotate: false, maxZoom: 21 };
+  Object.assign(sources, { area: data, outline: data, roads: data, matches: data, ends: data });
+  const hidden = { visibility: "none" };
   try {
     map = new maplibre.Map({
-      ...common, container: "map", bounds: references[0].bounds, fitBoundsOptions: { padding: padding() },
+      container: "map", bounds: references[0].bounds, fitBoundsOptions: { padding: padding() },
+      attributionControl: false, fadeDuration: 0, maxPitch: 0, dragRotate: false, maxZoom: 21,
       style: {
         version: 8, sources, layers: [
           { id: "ground", type: "background", paint: { "background-color": "#f3f1ec" } }, ...roads,
           { id: "area", type: "fill", source: "area", paint: { "fill-color": "#1a5fa5", "fill-opacity": 0.12 } },
           { id: "area-edge", type: "line", source: "area", paint: { "line-color": "#1a5fa5", "line-width": 2, "line-dasharray": [2, 1] } },
           { id: "outline-case", type: "line", source: "outline", paint: { "line-color": "#ffffff", "line-width": 6 } },
-          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } }, ...names,
+          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } },
+          { id: "seen-case", type: "line", source: "roads", paint: { "line-color": "#ffffff", "line-width": 5, "line-opacity": 0.75 } },
+          { id: "seen", type: "line", source: "roads", paint: { "line-color": "#e4572e", "line-width": 2.4 } },
+          { id: "matches", type: "line", source: "matches", layout: hidden, paint: { "line-color": "#6a1b9a", "line-width": 3 } },
+          { id: "ends", type: "circle", source: "ends", layout: hidden,
+            paint: { "circle-radius": 4.5, "circle-color": "#1b263b", "circle-stroke-color": "#ffffff", "circle-stroke-width": 1.5 } },
+          ...names,
         ],
       },
     });
@@ -66,38 +73,13 @@ export function makeMap({ references, basemap, basemap_attribution, max_zoom }) 
   map.addControl(new maplibre.NavigationControl({ showCompass: false }), "top-right");
   map.addControl(new maplibre.ScaleControl(), "bottom-right");
   map.addControl(new maplibre.AttributionControl({ compact: false }), "bottom-right");
-  // A second map above it holds the photograph, so that the style sheet alone can fade it and cut it off.
-  const above = document.createElement("div");
-  above.id = "over";
-  map.getContainer().insertBefore(above, map.getContainer().querySelector(".maplibregl-control-container"));
-  over = new maplibre.Map({
-    ...common, container: above, interactive: false, center: map.getCenter(), zoom: map.getZoom(),
-    style: {
-      version: 8, sources: { roads: data, matches: data, ends: data }, layers: [
-        { id: "roads-case", type: "line", source: "roads", paint: { "line-color": "#ffffff", "line-width": 5, "line-opacity": 0.75 } },
-        { id: "roads", type: "line", source: "roads", paint: { "line-color": "#e4572e", "line-width": 2.4 } },
-        { id: "matches", type: "line", source: "matches", layout: { visibility: "none" }, paint: { "line-color": "#6a1b9a", "line-width": 3 } },
-        { id: "ends", type: "circle", source: "ends", layout: { visibility: "none" },
-          paint: { "circle-radius": 4.5, "circle-color": "#1b263b", "circle-stroke-color": "#ffffff", "circle-stroke-width": 1.5 } },
-      ],
-    },
-  });
-  over.getCanvas().setAttribute("aria-hidden", "true");
-  over.getCanvas().tabIndex = -1;
-  map.on("move", follow);
-  over.once("load", follow);
-  map.on("resize", () => over.resize());
   map.on("click", ({ point, lngLat }) => {
     const reach = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
-    const [hit] = over.isStyleLoaded() ? over.queryRenderedFeatures(reach, { layers: ["ends"] }) : [];
+    const [hit] = map.isStyleLoaded() ? map.queryRenderedFeatures(reach, { layers: ["ends"] }) : [];
     if (hit) popup.setLngLat(lngLat).setText(`Residual ${hit.properties.residual.toFixed(1)} m`).addTo(map);
   });
   map.getCanvas().setAttribute("aria-label", "Map: arrow keys move it, plus and minus enlarge and reduce it");
   return true;
-}
-
-function follow() {
-  over.jumpTo({ center: map.getCenter(), zoom: map.getZoom(), bearing: map.getBearing(), pitch: map.getPitch() });
 }
 
 /** Room that the panel takes, so that what matters lies beside it. */
@@ -112,35 +94,35 @@ function plain(text) {
   return new Option(words).innerHTML;
 }
 
-const ready = (one) => new Promise((done) => (one.isStyleLoaded() ? done() : one.once("load", done)));
+const ready = () => new Promise((done) => (map.loaded() || map.isStyleLoaded() ? done() : map.once("load", done)));
 
 /** Show an answer: its view as the server tells it, and its document; nothing for null. */
 export async function showAnswer(base, view, found) {
   if (!map) return;
   shown = base;
-  await Promise.all([ready(map), ready(over)]);
+  await ready();
   if (shown !== base) return;
   clearMarkers();
-  if (over.getLayer("photo")) over.removeLayer("photo");
-  if (over.getSource("photo")) over.removeSource("photo");
-  const place = view?.place;
-  set(map, "outline", place ? [feature("LineString", place.outline)] : []);
-  set(over, "roads", place ? [feature("MultiLineString", place.roads)] : []);
-  set(over, "matches", (place?.matches ?? []).map((one) => feature("LineString", [one.map, one.seen])));
-  set(over, "ends", (place?.matches ?? []).map((one) => feature("Point", one.map, { residual: one.residual_m })));
+  if (map.getLayer("photo")) map.removeLayer("photo");
+  if (map.getSource("photo")) map.removeSource("photo");
+  const place = view?.place, matches = place?.matches ?? [];
+  set("outline", place ? [feature("LineString", place.outline)] : []);
+  set("roads", place ? [feature("MultiLineString", place.roads)] : []);
+  set("matches", matches.map((match) => feature("LineString", [match.map, match.seen])));
+  set("ends", matches.map((match) => feature("Point", match.map, { residual: match.residual_m })));
   if (!place) return;
   if (place.warped) {
-    over.addSource("photo", { type: "image", url: `${HERE}${base}/warped.webp`, coordinates: place.warped });
-    over.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "roads-case");
+    map.addSource("photo", { type: "image", url: `${HERE}${base}/warped.webp`, coordinates: place.warped });
+    map.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "outline-case");
   }
   setOpacity(opacity);
-  const box = place.outline.reduce((all, one) => all.extend(one), new maplibre.LngLatBounds());
+  const box = place.outline.reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds());
   if (found.status === "ambiguous") (found.alternatives ?? []).forEach(({ center }) => box.extend([center.lon, center.lat]));
   fit(box);
 }
 
-function set(one, source, features) {
-  one.getSource(source).setData(collection(features));
+function set(source, features) {
+  map.getSource(source).setData(collection(features));
 }
 
 /** Show all of a box, such as the bounds of a reference. */
@@ -152,18 +134,12 @@ let opacity = 0.85;
 /** Fade the photograph, not the roads above it. */
 export function setOpacity(value) {
   opacity = value;
-  if (over?.getLayer("photo")) over.setPaintProperty("photo", "raster-opacity", value);
-}
-
-/** Cut what lies above the map off left of a share of the window's width; null: nowhere. */
-export function cut(share) {
-  const above = document.getElementById("over");
-  if (above) above.style.clipPath = share === null ? "" : `inset(0 0 0 ${(share * 100).toFixed(2)}%)`;
+  if (map?.getLayer("photo")) map.setPaintProperty("photo", "raster-opacity", value);
 }
 
 export function showLayers(names, visible) {
-  if (!over) return;
-  ready(over).then(() => names.forEach((name) => over.setLayoutProperty(name, "visibility", visible ? "visible" : "none")));
+  if (!map) return;
+  ready().then(() => names.forEach((name) => map.setLayoutProperty(name, "visibility", visible ? "visible" : "none")));
 }
 
 /** Put a button on the map. */
@@ -180,7 +156,7 @@ export function addMarker(lonlat, text, label, kind, options = {}) {
 
 export function clearMarkers() {
   popup.remove();
-  markers.splice(0).forEach((one) => one.remove());
+  markers.splice(0).forEach((marker) => marker.remove());
 }
 
 export function middle() {
@@ -192,7 +168,7 @@ export function middle() {
 export function showArea(near) {
   if (!map) return;
   const ring = near && Array.from({ length: 65 }, (_, i) => offset(near, [near[2] * Math.cos(i * Math.PI / 32), near[2] * Math.sin(i * Math.PI / 32)]));
-  ready(map).then(() => set(map, "area", ring ? [feature("Polygon", [ring])] : []));
+  ready().then(() => set("area", ring ? [feature("Polygon", [ring])] : []));
 }
 
 let stop = null;

@@ -93,22 +93,22 @@ async function start(entry, path, options) {
 function watch(entry) {
   const events = new EventSource(`${entry.base}/events`);
   events.onmessage = ({ data }) => {
-    const told = JSON.parse(data);
-    if (told.status === "accepted" || told.status === "running") {
-      update(entry, { message: told.message, progress: told.progress });
+    const job = JSON.parse(data);
+    if (job.status === "accepted" || job.status === "running") {
+      update(entry, { message: job.message, progress: job.progress });
       return;
     }
     events.close();
-    finish(entry, told);
+    finish(entry, job);
   };
   events.onerror = () => {
     if (events.readyState === EventSource.CLOSED) update(entry, { status: "failed", message: "the server has forgotten it" });
   };
 }
 
-async function finish(entry, told) {
-  if (told.status !== "successful") {
-    update(entry, { status: told.status === "dismissed" ? "dismissed" : "failed", message: told.message });
+async function finish(entry, job) {
+  if (job.status !== "successful") {
+    update(entry, { status: job.status === "dismissed" ? "dismissed" : "failed", message: job.message });
     return;
   }
   try {
@@ -133,14 +133,14 @@ function update(entry, change) {
 }
 
 function keep() {
-  const told = answers.filter((one) => one.id).map(({ id, name, hints }) => ({ id, name, hints }));
-  sessionStorage.setItem(KEPT, JSON.stringify(told));
+  const known = answers.filter(({ id }) => id).map(({ id, name, hints }) => ({ id, name, hints }));
+  sessionStorage.setItem(KEPT, JSON.stringify(known));
 }
 
 /** What the page knew before it was loaded again. */
 async function recall() {
-  const told = JSON.parse(sessionStorage.getItem(KEPT) ?? "[]");
-  for (const { id, name, hints } of told.slice(0, kept)) {
+  const known = JSON.parse(sessionStorage.getItem(KEPT) ?? "[]");
+  for (const { id, name, hints } of known.slice(0, kept)) {
     const base = `jobs/${id}`;
     try {
       const job = await ask(base);
@@ -190,7 +190,6 @@ function show(entry) {
     view.showAnswer(entry.base, seen, found).then(() => entry === current && showPlaces(entry));
     view.showArea(sure ? null : entry.hints.near);
   }
-  setSwipe(placed && $("show-swipe").checked);
   $("places").hidden = status !== "ambiguous" || !placed;
   if (sure) showFiles(entry);
 }
@@ -242,13 +241,13 @@ function facts(found, matches) {
   copy.onclick = () => navigator.clipboard?.writeText(degrees(found.center)).then(() => { $("said").textContent = "Copied"; });
   const turn = ((found.rotation_deg % 360) + 360) % 360, rows = [["Middle", copy]];
   rows.push(["Pixel", `${found.gsd_m.toPrecision(3)} m`]);
-  rows.push(["Up is", `${WINDS[Math.round(turn / 45) % 8]}, ${turn.toFixed(0)}°`]);
+  rows.push(["Up is", `${WINDS[Math.round(turn / 45) % 8]}, ${Math.round(turn) % 360}°`]);
   if (found.tilt_deg > 2) rows.push(["Tilt", `${found.tilt_deg.toFixed(0)}°`]);
-  if (found.corner_sigma_m) rows.push(["Corners", `within about ${length(2 * Math.max(...found.corner_sigma_m))}`]);
+  if (found.corner_sigma_m) rows.push(["Corners", `± ${length(Math.max(...found.corner_sigma_m))} (standard deviation, at worst)`]);
   if (found.camera) rows.push(["Camera", `${length(found.camera.height_m)} above the ground`]);
   rows.push(["Roads", `${found.n_matched} of ${found.n_intersections} crossings matched`]);
   if (matches.length) {  // the largest come first
-    rows.push(["Residuals", `${length(matches[matches.length >> 1].residual_m)} in the middle, ${length(matches[0].residual_m)} at most`]);
+    rows.push(["Residuals", `median ${length(matches[matches.length >> 1].residual_m)}, largest ${length(matches[0].residual_m)}`]);
   }
   if (found.reference) rows.push(["Map", found.reference]);
   return rows;
@@ -477,25 +476,6 @@ function aimByKeys(event) {
   view.theMap().getCanvas().focus();
 }
 
-// --- the swipe --------------------------------------------------------------------------------------------------------
-
-let edge = 0.5;
-function setSwipe(on) {
-  $("swipe").hidden = !on;
-  if (!on) {
-    view.cut(null);
-    return;
-  }
-  moveSwipe(edge);
-}
-
-function moveSwipe(share) {
-  edge = Math.min(Math.max(share, 0.02), 0.98);
-  $("swipe").style.left = `${100 * edge}%`;
-  $("swipe").setAttribute("aria-valuenow", Math.round(100 * edge));
-  view.cut(edge);
-}
-
 // --- begin ------------------------------------------------------------------------------------------------------------
 
 function listen() {
@@ -523,8 +503,7 @@ function listen() {
     if (entry.base) ask(entry.base, { method: "DELETE" }).catch(() => {});
   };
   $("opacity").oninput = () => view.setOpacity($("opacity").value / 100);
-  $("show-swipe").onchange = () => setSwipe($("show-swipe").checked);
-  $("show-roads").onchange = () => view.showLayers(["roads", "roads-case"], $("show-roads").checked);
+  $("show-roads").onchange = () => view.showLayers(["seen", "seen-case"], $("show-roads").checked);
   $("show-matches").onchange = () => view.showLayers(["matches", "ends"], $("show-matches").checked);
   $("files-of").ontoggle = () => $("files-of").open && current?.document && showFiles(current);
   $("draw-circle").onclick = startDrawing;
@@ -558,13 +537,6 @@ function listen() {
     stopDrawing();
     setPicking(false);
   });
-  const swipe = $("swipe");
-  swipe.onpointerdown = (event) => swipe.setPointerCapture(event.pointerId);
-  swipe.onpointermove = (event) => swipe.hasPointerCapture(event.pointerId) && moveSwipe(event.clientX / innerWidth);
-  swipe.onkeydown = ({ key }) => {
-    const step = { ArrowLeft: -0.05, ArrowRight: 0.05 }[key];
-    if (step) moveSwipe(edge + step);
-  };
 }
 
 function showTyped() {
