@@ -138,8 +138,8 @@ class Answer(Location):
         x = grid.west + grid.resolution * (np.arange(grid.width) + 0.5)
         y = grid.north - grid.resolution * (np.arange(grid.height) + 0.5)
         transform = (grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north)
-        told = {"crs": subject.crs, "transform": transform, "query": self.query, "attribution": subject.attribution}
-        return xr.DataArray(values, {"y": y, "x": x}, ("y", "x"), name="road", attrs=told)
+        about = {"crs": subject.crs, "transform": transform, "query": self.query, "attribution": subject.attribution}
+        return xr.DataArray(values, {"y": y, "x": x}, ("y", "x"), name="road", attrs=about)
 
     def _subject(self) -> Subject:
         from roadgeo.outputs.paths import output_paths
@@ -242,7 +242,7 @@ def index(
     """
     from roadgeo.reference.library import make_slug
 
-    is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(one, int | float) for one in roads)
+    is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(road, int | float) for road in roads)
     if is_box or (isinstance(roads, str) and _is_place(roads)):
         from roadgeo.sources.roads import fetch_roads
 
@@ -347,12 +347,12 @@ def locate(
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
         sighting = locate_query(picture, references, options)
-    told = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
-    found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
-    indexes = tuple(one.index_of(sighting.location) for one in references)
+    origin = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
+    found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
+    indexes = tuple(item.index_of(sighting.location) for item in references)
     picture = picture if sighting.of_photograph else None
     photo, pixels = (picture, None) if isinstance(picture, str) else (None, picture)
-    return Answer(**{**found, **told}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
+    return Answer(**{**found, **origin}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
 
 
 def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
@@ -474,13 +474,13 @@ def track(
     options = TrackOptions(locate=_with_hints(LocateOptions(), given, None))
     moved = None if motion is None else read_motion(os.fspath(motion))
     reading = FrameOptions(gsd_m=_hint("gsd", gsd), motion=moved, every_s=every, interval_s=interval)
-    paths = [os.fspath(one) for one in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
+    paths = [os.fspath(frame) for frame in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
     opened: Any = _open(reference)
     if unordered:
         tracked = list(place_strips(list(read_stills(paths, reading)), opened, options))
     else:
         learnt = follow(read_frames(paths, reading), opened, options)
-        known = {one.frame.number: one for _, news in learnt for one in news}
+        known = {new.frame.number: new for _, news in learnt for new in news}
         tracked = [known[number] for number in sorted(known)]
     if not tracked:
         raise MaskError(f"no frames in {', '.join(paths)}")
@@ -543,8 +543,8 @@ def _digest(references: Sequence[AnyReference], location: Location) -> str:
     """Return the digest of the reference of a place, else of all; those that were not written have none."""
     from roadgeo.reference.inspection import reference_digest
 
-    here = [one for one in references if one.name == location.reference][:1] or references
-    paths = [one.index.path if isinstance(one, Reference) else one.path for one in here]
+    here = [reference for reference in references if reference.name == location.reference][:1] or references
+    paths = [item.index.path if isinstance(item, Reference) else item.path for item in here]
     return ", ".join(reference_digest(path) for path in paths if path)
 
 
@@ -555,4 +555,4 @@ def _open(reference: References) -> list[AnyReference]:
     given = [reference] if isinstance(reference, Reference | ShardedReference | str | os.PathLike) else list(reference)
     if not given:
         return open_references(())
-    return [open_references([os.fspath(one)])[0] if isinstance(one, str | os.PathLike) else one for one in given]
+    return [open_references([os.fspath(item)])[0] if isinstance(item, str | os.PathLike) else item for item in given]

@@ -195,9 +195,9 @@ class Camera:
         """Plain values."""
         sigma = np.sqrt(np.diag(self.covariance)).tolist()
         names = ("x_m", "y_m", "height_m", "heading_deg", "pitch_deg", "roll_deg")
-        told = {name: getattr(self, name) for name in ("x", "y", "lon", "lat", *names[2:])}
+        known = {name: getattr(self, name) for name in ("x", "y", "lon", "lat", *names[2:])}
         return {
-            **told,
+            **known,
             "ground_m": self.ground_m,
             "ground_spread_m": self.ground_spread_m,
             "altitude_m": self.altitude_m,
@@ -430,8 +430,8 @@ class Location:
         """The footprint as a GeoJSON Feature in longitude and latitude; no geometry where there is no place."""
         ring = [] if self.footprint_lonlat is None else self.footprint_lonlat.tolist()
         closed = {"type": "Polygon", "coordinates": [[*ring, ring[0]]]} if ring else None
-        told = {key: value for key, value in self.to_dict().items() if not isinstance(value, dict | list)}
-        return {"type": "Feature", "geometry": closed, "properties": told}
+        document = {key: value for key, value in self.to_dict().items() if not isinstance(value, dict | list)}
+        return {"type": "Feature", "geometry": closed, "properties": document}
 
     def to_geodataframe(self) -> gpd.GeoDataFrame:
         """Return the footprint and its attributes as a table of one row, in the location's CRS (WGS 84 without one).
@@ -492,9 +492,9 @@ class Location:
         def rows(array: FloatArray | None) -> list[Any] | None:
             return None if array is None else array.tolist()
 
-        def place(one: Place) -> dict[str, Any]:
-            middle = {"x": one.x, "y": one.y, "lon": one.lon, "lat": one.lat}
-            return {"center": middle, "log10_odds": one.log10_odds}
+        def place(other: Place) -> dict[str, Any]:
+            middle = {"x": other.x, "y": other.y, "lon": other.lon, "lat": other.lat}
+            return {"center": middle, "log10_odds": other.log10_odds}
 
         center = self.center
         rmse_m, rmse_px = self.rmse() or (None, None)
@@ -540,7 +540,7 @@ class Location:
             "log10_odds": self.log10_odds,
             "error_rate": None if self.error_rate is None else self.error_rate._asdict(),
             "runner_up": None if self.runner_up is None else place(self.runner_up),
-            "alternatives": [place(one) for one in self.alternatives],
+            "alternatives": [place(alternative) for alternative in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},
             "stats": asdict(self.stats),
             "stopped": self.stopped,

@@ -29,8 +29,8 @@ GROUPS = SOURCES, SEGMENTERS, OUTPUTS = "roadgeo.sources", "roadgeo.segmenters",
 
 def find_plugins(group: str) -> dict[str, EntryPoint]:
     """Find the plugins of a group, by name; nothing is imported. Where names clash, our own comes first."""
-    offered = sorted(entry_points(group=group), key=lambda one: (package_of(one) != "roadgeo", package_of(one)))
-    return {one.name: one for one in reversed(offered)}
+    offered = sorted(entry_points(group=group), key=lambda entry: (package_of(entry) != "roadgeo", package_of(entry)))
+    return {item.name: item for item in reversed(offered)}
 
 
 def package_of(plugin: EntryPoint) -> str:

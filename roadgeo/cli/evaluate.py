@@ -108,14 +108,14 @@ def evaluate_command(
     locator = ReferenceLocator((path,), make_options(hints, method))
     options = {name: value for name, value in options.items() if name not in _HINTED}
     known = {_HINTED[name]: value for name, value in hints.items() if value != "full"}
-    told = {"reference": path.stem, "method": method, **known}
+    about = {"reference": path.stem, "method": method, **known}
     if as_map:
-        survey = _survey(locator, options, told)
+        survey = _survey(locator, options, about)
         survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=partial(count_up, quiet=quiet))
         _write_map(survey, as_json, quiet)
         return
     query_set, settings = _query_set(path, queries, roads, options)
-    settings |= told
+    settings |= about
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
 
 
@@ -129,14 +129,14 @@ _HINTED = {
 }
 
 
-def _survey(locator: ReferenceLocator, options: dict[str, Any], told: dict[str, Any]) -> Survey:
+def _survey(locator: ReferenceLocator, options: dict[str, Any], about: dict[str, Any]) -> Survey:
     """Put together what a map of localizability is made with."""
     from roadgeo.evaluation.survey import ANY, Survey
 
     trials = options["count"] or 600
     ((simulation, _), *_) = query_sets(options | {"intersections": ANY})
     settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
-    settings = _known(settings | {"count": trials, "noise": simulation.kind}) | told
+    settings = _known(settings | {"count": trials, "noise": simulation.kind}) | about
     return Survey(locator.references[0], simulation, locator, trials, settings=settings)
 
 

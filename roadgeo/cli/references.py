@@ -69,7 +69,8 @@ def list_plugins(as_json: bool) -> None:
 
     found = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
     rows = [
-        (one.group, one.name, f"{one.dist.name} {one.dist.version}" if one.dist else "", one.value) for one in found
+        (plugin.group, plugin.name, f"{plugin.dist.name} {plugin.dist.version}" if plugin.dist else "", plugin.value)
+        for plugin in found
     ]
     if as_json:
         echo(json.dumps([dict(zip(("group", "name", "package", "object"), row, strict=True)) for row in rows]))
@@ -190,21 +191,23 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
     if types:
         commonest = ", ".join(f"{entry['d_b']} {entry['tuples']:,}" for entry in types[:4])
         lines.append(("tuple types", f"{len(types)}, the commonest: {commonest}"))
-    told = {key: value for key, value in meta.items() if isinstance(value, str) and key != "name"}
-    if "roads" in told:
-        told["roads"] = _kinds_text(told["roads"], meta.get("sources") or [])
-    return lines + [("kinds" if key == "roads" else key, value) for key, value in told.items()]
+    texts = {key: value for key, value in meta.items() if isinstance(value, str) and key != "name"}
+    if "roads" in texts:
+        texts["roads"] = _kinds_text(texts["roads"], meta.get("sources") or [])
+    return lines + [("kinds" if key == "roads" else key, value) for key, value in texts.items()]
 
 
 def _kinds_text(kinds: str, sources: Any) -> str:
     """Return which kinds were taken, and of which sources all lines, because they have no kinds of roads."""
-    told = [one for one in sources if isinstance(one, dict) and "kinds_known" in one]
-    unknown = [visible(str(one.get("name"))) for one in told if one["kinds_known"] is False]
+    known = [source for source in sources if isinstance(source, dict) and "kinds_known" in source]
+    unknown = [visible(str(source.get("name"))) for source in known if source["kinds_known"] is False]
     if not unknown:
         return kinds
     names = ", ".join(unknown)
     return (
-        f"not known, all lines of {names} were taken" if len(unknown) == len(told) else f"{kinds}; of {names} all lines"
+        f"not known, all lines of {names} were taken"
+        if len(unknown) == len(known)
+        else f"{kinds}; of {names} all lines"
     )
 
 

@@ -144,7 +144,7 @@ def serve_command(
     # Listen until Ctrl-C, or until a supervisor ends it.
     host = f"[{options.host}]" if ":" in options.host else options.host
     address = f"http://{host}:{server.server_port}/"
-    names = ", ".join(one.name for one in maps)
+    names = ", ".join(item.name for item in maps)
     echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
     if not no_browser and _has_screen():
         threading.Timer(0.5, webbrowser.open, [address]).start()

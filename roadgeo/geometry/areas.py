@@ -66,11 +66,11 @@ def lies_in(box: Box, lon: float, lat: float) -> bool:
     return overlap(box, (lon, lat, lon, lat))
 
 
-def overlap(one: Box, other: Box) -> bool:
+def overlap(first: Box, other: Box) -> bool:
     """Whether two boxes share ground."""
-    if one[1] > other[3] or other[1] > one[3]:
+    if first[1] > other[3] or other[1] > first[3]:
         return False
-    west, east = _unrolled(one)
+    west, east = _unrolled(first)
     from_west, to_east = _unrolled(other)
     return any(west <= to_east + turn and from_west + turn <= east for turn in (-360.0, 0.0, 360.0))
 

@@ -65,7 +65,7 @@ class RoadMask:
     def mirrored(self) -> RoadMask:
         """Return it turned over, left to right."""
         more = (self.observed, self.probability)
-        observed, probability = (None if one is None else one[:, ::-1].copy() for one in more)
+        observed, probability = (None if array is None else array[:, ::-1].copy() for array in more)
         return replace(self, roads=self.roads[:, ::-1].copy(), observed=observed, probability=probability)
 
     @property

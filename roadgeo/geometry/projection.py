@@ -137,7 +137,7 @@ def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
     steps = []
     for azimuth in (0.0, 90.0):
         ahead = Geod(ellps="WGS84").fwd(lon, lat, np.full(len(lon), azimuth), np.full(len(lon), 100.0))[:2]
-        ends = [np.stack(transformer("EPSG:4326", crs).transform(*one), axis=1) for one in ((lon, lat), ahead)]
+        ends = [np.stack(transformer("EPSG:4326", crs).transform(*points), axis=1) for points in ((lon, lat), ahead)]
         steps.append((ends[1] - ends[0]) / 100.0)
     scales = np.hypot(*np.moveaxis(np.stack(steps), -1, 0))
     skew = np.sum(steps[0] * steps[1], axis=1) / scales.prod(axis=0)

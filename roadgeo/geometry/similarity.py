@@ -56,8 +56,8 @@ def find_similarity(homography: FloatArray, corners: FloatArray, corner_covarian
     places, middle = Homography(homography).everywhere(corners), corners.mean(axis=0)
     origin = places.mean(axis=0)
     # X = a x - b y + X0, Y = b x + a y + Y0
-    (x, y), zero, one = (corners - middle).T, np.zeros(4), np.ones(4)
-    design = np.stack([np.c_[x, -y, one, zero], np.c_[y, x, zero, one]], axis=1).reshape(8, 4)
+    (x, y), zero, ones = (corners - middle).T, np.zeros(4), np.ones(4)
+    design = np.stack([np.c_[x, -y, ones, zero], np.c_[y, x, zero, ones]], axis=1).reshape(8, 4)
     weights, observed = whitener(corner_covariance), (places - origin).ravel()
     covariance = np.linalg.inv((weights @ design).T @ (weights @ design))
     parameters = covariance @ (weights @ design).T @ (weights @ observed)

@@ -43,12 +43,12 @@ class Exactness(NamedTuple):
         """Return a sentence on the accuracy of `what`, and the remedy; "" where nothing is missing."""
         if not self.grids:
             return f"{what} are not known how exact: PROJ knows no way from datum to datum" * math.isnan(self.sigma_m)
-        named, one = " and ".join(self.grids), len(self.grids) == 1
+        named, alone = " and ".join(self.grids), len(self.grids) == 1
         sync = " && ".join(f"pyproj sync --file {grid}" for grid in self.grids)
         known = "not known how exact" if math.isnan(self.sigma_m) else f"good to {self.sigma_m:g} m only"
         return (
-            f"{what} are {known}: PROJ lacks the grid{'' if one else 's'} {named}, with which they are good to "
-            f"{self.better_m:g} m; get {'it' if one else 'them'} by `{sync}`, or set PROJ_NETWORK=ON"
+            f"{what} are {known}: PROJ lacks the grid{'' if alone else 's'} {named}, with which they are good to "
+            f"{self.better_m:g} m; get {'it' if alone else 'them'} by `{sync}`, or set PROJ_NETWORK=ON"
         )
 
 
@@ -68,15 +68,15 @@ def exactness(source: str, target: str, lonlat: Sequence[float]) -> Exactness:
 
 @lru_cache(maxsize=256)
 def _exactness(source: str, target: str, lon: float, lat: float) -> Exactness:
-    one, other = known_crs(source), known_crs(target)
-    if one.geodetic_crs and one.geodetic_crs.equals(other.geodetic_crs, ignore_axis_order=True):
+    first, other = known_crs(source), known_crs(target)
+    if first.geodetic_crs and first.geodetic_crs.equals(other.geodetic_crs, ignore_axis_order=True):
         return Exactness(0.0)
     from pyproj.transformer import AreaOfInterest, TransformerGroup
 
     south, north = max(lat - _AROUND_DEG, -90.0), min(lat + _AROUND_DEG, 90.0)
     around = AreaOfInterest(lon - _AROUND_DEG, south, lon + _AROUND_DEG, north)
     with warnings.catch_warnings(action="ignore"):  # our own message on the missing grid is clearer
-        group = TransformerGroup(one, other, always_xy=True, area_of_interest=around)
+        group = TransformerGroup(first, other, always_xy=True, area_of_interest=around)
     best = group.transformers[0].accuracy if group.transformers else -1.0
     sigma = best if best >= 0.0 else math.nan
     if not group.best_available:

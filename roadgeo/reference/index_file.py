@@ -310,8 +310,8 @@ def _parse_manifest(data: mmap.mmap, path: str | os.PathLike[str]) -> tuple[dict
     version = _parse_version(data, path)
     _, _, size, digest = _PREAMBLE.unpack_from(data)
     if version != FORMAT_VERSION:
-        told = f"it has format version {version}, and this roadgeo {__version__} reads version {FORMAT_VERSION}"
-        _refuse(path, told + ("; use a later roadgeo, or else" if version > FORMAT_VERSION else ""))
+        versions = f"it has format version {version}, and this roadgeo {__version__} reads version {FORMAT_VERSION}"
+        _refuse(path, versions + ("; use a later roadgeo, or else" if version > FORMAT_VERSION else ""))
     if size > _MAX_MANIFEST or _PREAMBLE.size + size > len(data):
         _refuse(path, "it is truncated, or its manifest's size is wrong")
     raw = data[_PREAMBLE.size : _PREAMBLE.size + size]

@@ -92,8 +92,8 @@ def _fetch(url: str, target: Path, most: float) -> None:
     with _reaching(url):
         import fsspec
 
-        told = {"client_kwargs": {"trace_configs": [_redirects()]}} if protocol.lower() in {"http", "https"} else {}
-        files = fsspec.filesystem(protocol.lower(), **told)
+        settings = {"client_kwargs": {"trace_configs": [_redirects()]}} if protocol.lower() in {"http", "https"} else {}
+        files = fsspec.filesystem(protocol.lower(), **settings)
     with staging(target) as folder:
         with _reaching(url):
             files.get_file(files._strip_protocol(url), str(folder / target.name), callback=_at_most(most))

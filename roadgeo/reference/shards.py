@@ -188,13 +188,13 @@ def read_manifest(path: Path) -> Manifest:
         raise IndexFormatError(f"{path}: is damaged, or of another version: {error}; {again}") from error
 
 
-def _parse_manifest(told: Any) -> Manifest:
+def _parse_manifest(document: Any) -> Manifest:
     """Make a manifest of JSON values, which may hold anything."""
-    if type(told) is not dict or told.pop("schema", None) != SCHEMA:
+    if type(document) is not dict or document.pop("schema", None) != SCHEMA:
         raise ValueError(f"expected an object of schema {SCHEMA}")
-    shards = tuple(ShardEntry.from_dict(values) for values in told.pop("shards"))
-    coarse = told.pop("coarse", None)
-    found = Manifest(**told, shards=shards, coarse=None if coarse is None else ShardEntry.from_dict(coarse))
+    shards = tuple(ShardEntry.from_dict(values) for values in document.pop("shards"))
+    coarse = document.pop("coarse", None)
+    found = Manifest(**document, shards=shards, coarse=None if coarse is None else ShardEntry.from_dict(coarse))
     texts = (found.name, found.build, found.crs, found.roadgeo)
     if any(type(text) is not str for text in texts) or not _NAME.fullmatch(found.build):
         raise ValueError("a name is wrong")
@@ -314,17 +314,17 @@ class ShardedReference:
         if center is None or location.footprint is None:
             return self.parts[-1].open()
         near = (center.lon, center.lat, 0.0)
-        here = [one for one in self.parts if one.entry.crs == location.crs and touches(one.entry.reach, near)]
+        here = [part for part in self.parts if part.entry.crs == location.crs and touches(part.entry.reach, near)]
         wide = np.ptp(location.footprint, axis=0).max() > 2.0 * self.manifest.margin_m
         return min(
             here or self.parts,
-            key=lambda one: ((one is self.coarse) != wide, not touches(one.entry.ground, near)),
+            key=lambda part: ((part is self.coarse) != wide, not touches(part.entry.ground, near)),
         ).open()
 
     def indexes_at(self, places: Sequence[tuple[float, float]]) -> list[ReferenceIndex]:
         """Return the indexes of the shards on whose ground places (longitude, latitude) lie, at least one."""
-        held = [one for one in self.shards if any(touches(one.entry.ground, (*place, 0.0)) for place in places)]
-        return [one.open() for one in (held or self.shards[:1])[:_MOST_DRAWN]]
+        held = [shard for shard in self.shards if any(touches(shard.entry.ground, (*place, 0.0)) for place in places)]
+        return [shard.open() for shard in (held or self.shards[:1])[:_MOST_DRAWN]]
 
 
 #: A page of an overview draws no more shards than this.

@@ -90,8 +90,8 @@ def _each(values: AnyArray, test: Any) -> BoolArray:
     verdicts: dict[Any, bool] = {}
     result = np.empty(len(values), bool)
     for i, value in enumerate(values):
-        one = value.item() if isinstance(value, np.generic) else value
-        key = tuple(map(str, one)) if isinstance(one, Iterable) and not isinstance(one, str) else one
+        item = value.item() if isinstance(value, np.generic) else value
+        key = tuple(map(str, item)) if isinstance(item, Iterable) and not isinstance(item, str) else item
         if key not in verdicts:
             verdicts[key] = bool(test(_names(key)))
         result[i] = verdicts[key]

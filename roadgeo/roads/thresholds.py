@@ -170,7 +170,7 @@ def _spread(values: AnyArray, first: float) -> tuple[float, ...]:
     for share in _FURTHER:
         threshold = ground + share * (road - ground)
         area = float(np.mean((values > threshold) != inverted))
-        if area > 0 and all(max(area, one) > 1.15 * min(area, one) for one in areas):
+        if area > 0 and all(max(area, other) > 1.15 * min(area, other) for other in areas):
             chosen.append(threshold)
             areas.append(area)
     return tuple(chosen)

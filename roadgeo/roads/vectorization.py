@@ -165,13 +165,13 @@ def _refuse_corners(states: AnyArray, name: str, options: VectorizeOptions) -> N
 def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, options: VectorizeOptions) -> None:
     """Refuse lines that cannot be roads, before all slow steps: hatching, halftones, noise."""
     n_pieces, covered = len(skeleton.edges), float(skeleton.lengths.sum()) * width / area
-    told = f"{n_pieces:,} pieces of road, expected at most {options.max_pieces:,}"
+    counted = f"{n_pieces:,} pieces of road, expected at most {options.max_pieces:,}"
     if covered > options.max_cover:
-        told = f"{n_pieces:,} pieces of road that would cover {covered:.0%} of the frame"
+        counted = f"{n_pieces:,} pieces of road that would cover {covered:.0%} of the frame"
     elif n_pieces <= options.max_pieces:
         return
     raise MaskError(
-        f"{name}: falls into {told}: this looks like noise; smooth it before it is thresholded, or reduce it"
+        f"{name}: falls into {counted}: this looks like noise; smooth it before it is thresholded, or reduce it"
     )
 
 

@@ -47,8 +47,8 @@ class Tiles:
     def describe(self) -> list[dict[str, Any]]:
         """Return each reference's name, its bounds in degrees, and whom its licence asks to name."""
         return [
-            {"name": one.name, "bounds": list(_bounds(one)), "attribution": _attribution(one)}
-            for one in self._references
+            {"name": reference.name, "bounds": list(_bounds(reference)), "attribution": _attribution(reference)}
+            for reference in self._references
         ]
 
     def _tile(self, number: int, zoom: int, column: int, row: int) -> bytes:

@@ -63,7 +63,7 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     """Write the page's view of an answer for the image at `path`, and keep the inputs of its files."""
     location, folder = sighting.location, path.parent.with_name(OWN)
     folder.mkdir(exist_ok=True)
-    indexes = [one.index_of(location) for one in references]
+    indexes = [reference.index_of(location) for reference in references]
     photo = path if sighting.of_photograph else None
     try:
         shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ViewOptions(picture_px=_SIDE), "")
@@ -100,7 +100,7 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
         raise OutputError("there is no place on the map to show")
     if output.needs_camera and location.camera is None:
         raise OutputError("no camera above the ground would see the frame so")
-    indexes = [one.index_of(location) for one in references]
+    indexes = [reference.index_of(location) for reference in references]
     subject = Subject(
         location, mask, paths, ImageOptions(max_pixels=64_000_000), path if of_photograph else None, indexes
     )
@@ -120,11 +120,11 @@ def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
     def lay(pixels: FloatArray) -> FloatArray:
         return to_lonlat(place.crs, place.to_crs(pixels))
 
-    roads = [line for line in (lay(one) for one in shown.lines) if np.isfinite(line).all()]
-    matches, told = shown.matches(), []
+    roads = [line for line in (lay(item) for item in shown.lines) if np.isfinite(line).all()]
+    matches, values = shown.matches(), []
     if matches is not None:
         seen, there = lay(plane_to_pixel(matches.query_xy)), to_lonlat(place.crs, matches.reference_xy)
-        told = [
+        values = [
             {"seen": _rounded(a, 7), "map": _rounded(b, 7), "residual_m": round(float(residual), 2)}
             for a, b, residual in zip(seen, there, matches.residual_m, strict=True)
             if np.isfinite([*a, *b]).all()
@@ -133,7 +133,7 @@ def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
         "outline": _rounded(lay(_outline(shown.size)), 7),
         "warped": _draw_on_map(folder / WARPED, shown, place),
         "roads": [_rounded(line, 7) for line in roads],
-        "matches": told,
+        "matches": values,
     }
 
 

@@ -89,12 +89,12 @@ def _stream_gdal(
     import shapely
 
     layers = _choose_layers(path, layer, areas=areas)
-    for n, one in enumerate(layers):
-        total, columns = _choose_columns(path, one)
+    for n, held in enumerate(layers):
+        total, columns = _choose_columns(path, held)
         for skip in range(0, max(total, 1), most):
-            found = read_layer(path, one, columns, skip, most if total > most else None)
+            found = read_layer(path, held, columns, skip, most if total > most else None)
             if found.shapes is None:
-                raise NoRoadsError(f"{path}: layer {one!r} has no geometry, expected lines")
+                raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
             shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
             meta = {"format": found.driver, "layer": ", ".join(layers), **found.told}
             yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
@@ -184,8 +184,8 @@ def _geometry_of(file: Any) -> tuple[str, str | None, str]:
     stored = file.schema_arrow.metadata or {}
     if b"geo" in stored:
         geo = json.loads(stored[b"geo"])
-        told = geo["columns"][geo["primary_column"]]
-        return geo["primary_column"], crs_name(told.get("crs", "EPSG:4326")), str(told.get("encoding"))
+        column = geo["columns"][geo["primary_column"]]
+        return geo["primary_column"], crs_name(column.get("crs", "EPSG:4326")), str(column.get("encoding"))
     schema = file.schema_arrow
     for name in sorted(schema.names, key=lambda name: (name.lower() not in _SHAPES, name)):
         kind = schema.field(name).type
@@ -275,7 +275,7 @@ def held_table(roads: Any) -> RoadTable:
             rows, broken = roads.astype(float), ~np.isfinite(roads.astype(float)).all(axis=1)
             parts = zip(np.split(rows, np.flatnonzero(broken)), np.split(broken, np.flatnonzero(broken)), strict=True)
             listed = [part[~gap] for part, gap in parts]
-        shapes = [one if one is None or isinstance(one, shapely.Geometry) else _line(one) for one in listed]
+        shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
     except (TypeError, ValueError) as error:
         raise RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {error}; {_EXPECTED}") from error
     return RoadTable(objects(shapes), crs_name(getattr(roads, "crs", None)))
@@ -351,13 +351,13 @@ def overpass_table(elements: Sequence[Any]) -> RoadTable:
     """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere."""
     import shapely
 
-    known = [one for one in elements if isinstance(one, Mapping)]
-    nodes = {one["id"]: one for one in known if one.get("type") == "node" and isinstance(one.get("id"), int)}
+    known = [element for element in elements if isinstance(element, Mapping)]
+    nodes = {node["id"]: node for node in known if node.get("type") == "node" and isinstance(node.get("id"), int)}
     shapes: list[Any] = []
     tags: list[Mapping[str, Any]] = []
     for way in known:
-        told = way.get("tags")
-        if way.get("type") != "way" or not isinstance(told, Mapping) or "highway" not in told:
+        own = way.get("tags")
+        if way.get("type") != "way" or not isinstance(own, Mapping) or "highway" not in own:
             continue
         try:
             ends = way.get("geometry") or [nodes.get(node) for node in way.get("nodes") or ()]
@@ -365,7 +365,7 @@ def overpass_table(elements: Sequence[Any]) -> RoadTable:
         except (LookupError, TypeError, ValueError, OverflowError):
             places = []
         shapes.append(shapely.LineString(places) if len(places) > 1 else None)
-        tags.append(told)
+        tags.append(own)
     lost = {"without_places": shapes.count(None)} if None in shapes else {}
     meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION}
     return RoadTable(objects(shapes), "EPSG:4326", _columns(tags), meta | lost)

@@ -92,7 +92,7 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
             return None
         empty = False if name == "tunnel" else None
         columns = [(getattr(part, name), len(part.lines)) for part in parts]
-        return np.concatenate([np.full(n, empty) if one is None else one for one, n in columns])
+        return np.concatenate([np.full(n, empty) if item is None else item for item, n in columns])
 
     lines, areas = (np.concatenate([getattr(part, name) for part in parts]) for name in ("lines", "areas"))
     return RoadLines(lines, first.crs, column("highway"), column("tunnel"), meta, column("name"), areas)

@@ -171,7 +171,7 @@ def open_mask(
         _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
         own = raster.model_threshold
         if own is not None and threshold is None:
-            values = tuple(float(round(PROBABILITY_SURE * one)) for one in spread_probability(own))
+            values = tuple(float(round(PROBABILITY_SURE * item)) for item in spread_probability(own))
             yield MaskSource(values, raster, 0, False, (0.0, float(PROBABILITY_SURE)))
             return
         _require_mask(raster)
@@ -205,9 +205,9 @@ def _drawn(raster: _Raster) -> _Raster:
 
 def _without_unlabelled(raster: _Raster, sample: Sample) -> tuple[_Raster, Sample]:
     """Leave out pixels without a label in a map of labels, and report how its values were read."""
-    unlabelled, told = find_unlabelled(sample)
-    if told:
-        _LOG.warning("%s: %s; another --threshold tells them apart otherwise", visible(raster.name), told)
+    unlabelled, reason = find_unlabelled(sample)
+    if reason:
+        _LOG.warning("%s: %s; another --threshold tells them apart otherwise", visible(raster.name), reason)
     if unlabelled is None:
         return raster, sample
 

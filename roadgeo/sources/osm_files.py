@@ -161,13 +161,13 @@ class _Census:
 
         nodes, xy, ways = array("q"), array("i"), array("q")
         for part, _ in _parts(path):
-            one: Any
-            for one in osmium.FileProcessor(part, osmium.osm.NODE | osmium.osm.WAY, pool):
-                if one.is_way():
-                    ways.extend((one.id, one.version))
+            item: Any
+            for item in osmium.FileProcessor(part, osmium.osm.NODE | osmium.osm.WAY, pool):
+                if item.is_way():
+                    ways.extend((item.id, item.version))
                 else:
-                    nodes.extend((one.id, one.version))
-                    xy.extend((one.location.x, one.location.y))
+                    nodes.extend((item.id, item.version))
+                    xy.extend((item.location.x, item.location.y))
         kept, _ = _newest(nodes)
         _, old = _newest(ways)
         ids = np.frombuffer(nodes, np.int64).reshape(-1, 2)[kept, 0] if nodes else np.empty(0, np.int64)

@@ -116,7 +116,7 @@ def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions
                 continue
         for file in sorted(folder.glob("*.json")):
             answer = json.loads(file.read_bytes())
-            found |= {(str(one["type"]), str(one["id"])): one for one in answer["elements"]}
+            found |= {(str(item["type"]), str(item["id"])): item for item in answer["elements"]}
             stamps += re.findall(r"timestamp_osm_base\W+([-\w:]+)", json.dumps(answer.get("osm3s")))
         if not found:
             shutil.rmtree(folder)

@@ -67,7 +67,7 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
             why[file] = str(error).removeprefix(f"{file}: ")
     if any(tells.values()):
         why |= {
-            file: "it does not tell roads from other lines, as others do" for file, told in tells.items() if not told
+            file: "it does not tell roads from other lines, as others do" for file, tell in tells.items() if not tell
         }
     for file, reason in why.items():
         _LOG.warning(
@@ -145,7 +145,7 @@ def stream_lines(
     RoadSourceError
         The file is missing, unreadable, empty or holds no lines.
     """
-    n, told = 0, {"no_roads": 0, "without_places": 0}
+    n, counts = 0, {"no_roads": 0, "without_places": 0}
     with reading(path), tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
         for file in _unpacked(path, Path(folder)):
             schema = None
@@ -153,15 +153,15 @@ def stream_lines(
                 schema = schema or recognise(table)
                 part = schema.adapt(table)
                 n += len(part.lines) + (len(part.areas) if areas else 0)
-                told = {key: value + part.meta.get(key, 0) for key, value in told.items()}
+                counts = {key: value + part.meta.get(key, 0) for key, value in counts.items()}
                 yield part
     if n == 0:
         why = "expected the centre lines of roads"
-        if told["without_places"]:
+        if counts["without_places"]:
             why = "for the nodes of its ways are not in it: export them too (of Overpass: out body; >; out skel qt;)"
-        elif told["no_roads"]:
-            why = f"for its {told['no_roads']:,} features are something else, such as streams, railways or fences"
-        raise NoRoadsError(f"{path}: no {'roads' if told['no_roads'] else 'lines'} in it, {why}")
+        elif counts["no_roads"]:
+            why = f"for its {counts['no_roads']:,} features are something else, such as streams, railways or fences"
+        raise NoRoadsError(f"{path}: no {'roads' if counts['no_roads'] else 'lines'} in it, {why}")
 
 
 def _unpacked(path: Path, folder: Path) -> list[Path]:

@@ -70,15 +70,15 @@ def name_crs(crs: Any) -> str:
     """
     from pyproj.exceptions import CRSError
 
-    told = f"{str(crs)[:60]!r}"
+    text = f"{str(crs)[:60]!r}"
     expected = "expected for example EPSG:3857, 3857, a name such as 'WGS 84 / UTM zone 29N', or WKT"
     try:
         known = known_crs(crs)
     except CRSError as error:
-        raise NoCrsError(f"{told} is no CRS that PROJ knows; {expected}") from error
+        raise NoCrsError(f"{text} is no CRS that PROJ knows; {expected}") from error
     known = known.to_2d() if len(known.axis_info) == 3 else known
     if not (known.is_geographic or known.is_projected):
-        raise NoCrsError(f"{told} is no CRS of a map, but a {known.type_name}; {expected}")
+        raise NoCrsError(f"{text} is no CRS of a map, but a {known.type_name}; {expected}")
     code = known.to_epsg(min_confidence=100)
     return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
 
@@ -105,10 +105,10 @@ def _checked(crs: Any) -> CRS:
     return known
 
 
-def _refuse(told: Any, crs: Any = None) -> None:
+def _refuse(source: Any, crs: Any = None) -> None:
     """Refuse a CRS that names a file, given in whatever way pyproj takes it."""
-    crs = told if crs is None else crs
-    found = named_file("\n".join(all_text(told)) if isinstance(told, dict | list) else str(told))
+    crs = source if crs is None else crs
+    found = named_file("\n".join(all_text(source)) if isinstance(source, dict | list) else str(source))
     if found:
         raise CrsError(
             f"the CRS {str(crs)[:60]!r} names the file {found[:60]!r}, which is not opened; expected a grid's name "

@@ -138,10 +138,10 @@ def _of_json(path: Path, content: mmap.mmap) -> Iterator[str]:
         text = content[match.end() : match.end() + _WINDOWS[0]].lstrip()
         if not text.startswith((b":", b"/")):  # a value, or a word in a text
             continue
-        told = _decoded(content[match.end() : match.end() + _WINDOWS[1]], path)
-        if isinstance(told, dict) and str(told.get("type")).lower() in ("link", "url"):
+        document = _decoded(content[match.end() : match.end() + _WINDOWS[1]], path)
+        if isinstance(document, dict) and str(document.get("type")).lower() in ("link", "url"):
             raise RoadSourceError(f"{path}: gives its CRS as a link, which is not followed; name it in the file")
-        yield from all_text(told)
+        yield from all_text(document)
 
 
 def _decoded(content: bytes, path: Path) -> Any:

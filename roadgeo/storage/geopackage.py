@@ -407,7 +407,9 @@ def _encode_multipolygons(geometries: Sequence[Any] | FloatArray, srs_id: int) -
         box = [*boxes[:, [0, 2]].min(axis=0), *boxes[:, [1, 3]].max(axis=0)]
         bounds.append([box[0], box[2], box[1], box[3]])
         count = struct.pack("<BII", 1, _WKB_TYPES["MULTIPOLYGON"], len(parts))
-        blobs.append(b"".join([_HEADER.pack(b"GP\0\3", srs_id, *bounds[-1]), count, *(one[header:] for one in parts)]))
+        blobs.append(
+            b"".join([_HEADER.pack(b"GP\0\3", srs_id, *bounds[-1]), count, *(part[header:] for part in parts)])
+        )
     return blobs, np.array(bounds)
 
 

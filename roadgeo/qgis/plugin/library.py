@@ -71,15 +71,15 @@ def _geopackage(files: list[str]) -> str:
 
 def find_reference(value: str) -> Reference:
     """Return the reference that a name or a file stands for."""
-    known = (one for one in list_references() if value in (one.name, one.value))
+    known = (reference for reference in list_references() if value in (reference.name, reference.value))
     return next(known, Reference(Path(value).stem, value, _geopackage([value])))
 
 
 def list_places(location: dict[str, Any]) -> list[Place]:
     """List the places at which a picture may lie, the likeliest first, with the maps that hold them."""
     best = [{"center": location["center"], "log10_odds": location["log10_odds"]}] if location["center"] else []
-    maps = sorted(list_references(), key=lambda one: one.name != location["reference"])
-    boxes = [(one.name, _box(one.file)) for one in maps if one.file]
+    maps = sorted(list_references(), key=lambda held: held.name != location["reference"])
+    boxes = [(held.name, _box(held.file)) for held in maps if held.file]
     places = []
     for found in [*best, *location["alternatives"]]:
         lon, lat = found["center"]["lon"], found["center"]["lat"]

@@ -74,7 +74,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
         ]
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} is no file of control points: expected the columns {_COLUMNS}") from error
-    if not all(math.isfinite(v) for one in matches for v in (one.column, one.row, one.x, one.y)):
+    if not all(math.isfinite(v) for match in matches for v in (match.column, match.row, match.x, match.y)):
         raise ValueError(f"{path} holds a control point that is no number")
     return crs, matches
 
@@ -92,12 +92,12 @@ def fit(matches: Sequence[Match]) -> Fit:
 
     Four are met exactly. It starts from the linear solution in normalised coordinates (Hartley & Zisserman, 4.1, 4.4).
     """
-    chosen = [one for one in matches if one.on]
+    chosen = [match for match in matches if match.on]
     nothing = Fit(None, [math.nan] * len(matches))
     if len(chosen) < FEWEST:
         return nothing
-    source = np.array([(one.column, one.row) for one in chosen])
-    target = np.array([(one.x, one.y) for one in chosen])
+    source = np.array([(match.column, match.row) for match in chosen])
+    target = np.array([(match.x, match.y) for match in chosen])
     from_source, from_target = _normaliser(source), _normaliser(target)
     uv, xy = place(from_source, source), place(from_target, target)
     system = np.zeros((2 * len(uv), 9))
@@ -112,8 +112,8 @@ def fit(matches: Sequence[Match]) -> Fit:
     if matrix is None:
         return nothing
     matrix = np.linalg.inv(from_target) @ matrix @ from_source
-    every = place(matrix, np.array([(one.column, one.row) for one in matches]))
-    gaps = every - np.array([(one.x, one.y) for one in matches])
+    every = place(matrix, np.array([(match.column, match.row) for match in matches]))
+    gaps = every - np.array([(match.x, match.y) for match in matches])
     return Fit(matrix / matrix[2, 2], np.hypot(*gaps.T).tolist())
 
 

@@ -112,7 +112,7 @@ class Network:
         if not roads:
             held = np.unique(classes[classes != 0])
             if len(held) > 1:
-                listed = ", ".join(f"{one:g}" for one in held[:10])
+                listed = ", ".join(f"{item:g}" for item in held[:10])
                 raise ModelError(f"{self.name}: gives the classes {listed}; choose the road: --class NUMBER")
             return np.asarray(classes != 0, np.float32)
         return np.asarray(np.isin(classes, roads), np.float32)

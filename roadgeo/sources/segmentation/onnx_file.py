@@ -236,12 +236,12 @@ def _limit_memory() -> None:
         onnxruntime.create_and_register_allocator(where, onnxruntime.OrtArenaCfg(_MAX_MEMORY, -1, -1, -1))
 
 
-def _port(told: Any) -> Port:
+def _port(port: Any) -> Port:
     """Translate onnxruntime's description of an input or output: tensor(float16), [1, 3, "height", None]."""
-    kind = str(told.type).removeprefix("tensor(").removesuffix(")")
+    kind = str(port.type).removeprefix("tensor(").removesuffix(")")
     kind = {"float": "float32", "double": "float64"}.get(kind, kind)
-    shape = tuple(side if isinstance(side, int) and side > 0 else None for side in told.shape)
-    return Port(told.name, kind, shape)
+    shape = tuple(side if isinstance(side, int) and side > 0 else None for side in port.shape)
+    return Port(port.name, kind, shape)
 
 
 def _text(value: bytes) -> str:

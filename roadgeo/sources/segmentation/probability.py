@@ -129,31 +129,31 @@ def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
         They show frames of different proportions.
     """
     first = maps[0]
-    alike = all(one.threshold == first.threshold for one in maps)
+    alike = all(item.threshold == first.threshold for item in maps)
     height, width = first.values.shape
-    for one in maps:
-        rows, columns = one.values.shape
+    for entry in maps:
+        rows, columns = entry.values.shape
         if abs(rows * width - columns * height) > 0.01 * rows * width:
             raise MaskError(
-                f"{one.name}: {columns} x {rows} pixels, but {first.name} {width} x {height}; "
+                f"{entry.name}: {columns} x {rows} pixels, but {first.name} {width} x {height}; "
                 "expected looks at the same frame: cut them alike, or locate them one by one"
             )
-    values = [one.resized((height, width)).values for one in maps]
-    thresholds = [0.5 if alike else one.threshold for one in maps]
+    values = [item.resized((height, width)).values for item in maps]
+    thresholds = [0.5 if alike else item.threshold for item in maps]
     fused = np.empty((height, width), np.uint8)
     step = max(1, _STRIP_PIXELS // width)
     for top in range(0, height, step):
-        fused[top : top + step] = _mean([one[top : top + step] for one in values], thresholds)
-    models = dict.fromkeys(one.model for one in maps)
+        fused[top : top + step] = _mean([value[top : top + step] for value in values], thresholds)
+    models = dict.fromkeys(item.model for item in maps)
     return ProbabilityMap(fused, first.threshold if alike else 0.5, first.name, " + ".join(models), first.pixel)
 
 
 def _mean(values: Sequence[AnyArray], thresholds: Sequence[float]) -> AnyArray:
     """Return the mean of the log odds of those (H, W) that observed a pixel, as a probability."""
     total, count = np.zeros(values[0].shape, np.float32), np.zeros(values[0].shape, np.float32)
-    for one, threshold in zip(values, thresholds, strict=True):
-        seen = one != NODATA
-        total += np.where(seen, _log_odds(one, threshold), 0)
+    for value, threshold in zip(values, thresholds, strict=True):
+        seen = value != NODATA
+        total += np.where(seen, _log_odds(value, threshold), 0)
         count += seen
     share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
     return np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)

@@ -150,9 +150,9 @@ def _blend(
             weights[:rows, left : left + columns] += weight[:rows, :columns]
         done = next_top - top
         yield np.divide(total[:done], weights[:done])
-        for one in (total, weights):
-            one[: size[0] - done] = one[done:].copy()
-            one[size[0] - done :] = 0
+        for item in (total, weights):
+            item[: size[0] - done] = item[done:].copy()
+            item[size[0] - done :] = 0
 
 
 def _starts(length: int, tile: int, overlap: float) -> list[int]:
