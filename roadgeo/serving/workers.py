@@ -403,10 +403,9 @@ def _write(asked: Asked, references: Sequence[Any]) -> Answer:
 
 def _size(path: str) -> tuple[int, int]:
     """Return (width, height) of an image without unpacking it."""
-    from roadgeo.storage.rasters import image_size, raster_size
+    from roadgeo.storage.rasters import raster_size
 
-    size = image_size(Path(path))
-    return raster_size(path) if size is None else size[:2]
+    return raster_size(path)
 
 
 def _without(path: str, message: str) -> str:

@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_SIDE",
-    "image_size",
     "open_raster",
     "raster_size",
     "read_palette",
@@ -204,35 +203,6 @@ def require_file(path: str | os.PathLike[str], name: str) -> None:
         raise MaskError(f"{name}: is a folder; give a raster file")
     if not stat.S_ISREG(mode):
         raise MaskError(f"{name}: is a pipe or device; expected a regular file: save the raster first")
-
-
-def image_size(path: Path) -> tuple[int, int, int] | None:
-    """Read (width, height, bytes when decoded) of a PNG, JPEG or BMP from its header; None where it has none."""
-    with path.open("rb") as file:
-        head = file.read(30)
-        if head.startswith(b"\x89PNG") and len(head) >= 26:
-            width, height, depth, colour = struct.unpack(">IIBB", head[16:26])
-            samples = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}.get(colour, 4)
-            return width, height, width * height * samples * (2 if depth == 16 else 1)
-        if head.startswith(b"BM") and len(head) >= 26:
-            width, height = struct.unpack("<ii", head[18:26])
-            return abs(width), abs(height), abs(width * height) * 4
-        return _jpeg_size(file) if head.startswith(b"\xff\xd8") else None
-
-
-def _jpeg_size(file: BinaryIO) -> tuple[int, int, int] | None:
-    """Walk the segments of a JPEG to its frame header (ITU T.81, B.2)."""
-    file.seek(2)
-    while len(head := file.read(4)) == 4 and head[0] == 0xFF:
-        marker, size = head[1], int.from_bytes(head[2:], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            frame = file.read(6)
-            if len(frame) < 6:
-                return None
-            height, width = struct.unpack(">HH", frame[1:5])
-            return width, height, width * height * frame[5]
-        file.seek(size - 2, os.SEEK_CUR)
-    return None
 
 
 def read_palette(dataset: DatasetReader) -> AnyArray | None:

@@ -51,7 +51,7 @@ def test_names_of_masks_do_not_speak_to_the_terminal(
     assert main(["vectorize", *masks, "-o", str(tmp_path)]) == 1
     said = "".join(capfd.readouterr())
     assert not [item for item in FORBIDDEN if item in said]
-    assert "intersections are seen" in said
+    assert "intersections are seen" in said or "its name is not valid text" in said
     assert "fault of roadgeo" not in said
 
 

@@ -23,7 +23,7 @@ from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import image_size, open_raster, raster_size, writing_raster
+from roadgeo.storage.rasters import open_raster, raster_size, writing_raster
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -258,18 +258,6 @@ class TestSizes:
         (tmp_path / "a.png").write_bytes(png(side, side))
         with pytest.raises(MaskError, match=told):
             read_mask(tmp_path / "a.png")
-
-    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
-    def test_like_the_image(self, tmp_path, suffix):
-        for shape in ((90, 70), (33, 400, 3)):
-            path = tmp_path / f"a{suffix}"
-            cv2.imwrite(str(path), np.zeros(shape, np.uint8))
-            size = image_size(path)
-            assert size is not None
-            assert size[:2] == (shape[1], shape[0])
-            assert size[2] >= np.prod(shape)
-            path.write_bytes(path.read_bytes()[:12])
-            assert image_size(path) is None
 
     @pytest.mark.parametrize("bits", [24, 32])
     def test_a_bmp_that_gdal_does_not_read_is_refused_in_a_line(self, tmp_path, roads, bits):

@@ -107,13 +107,13 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
 
 def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -> ModelCard:
     kind = str(told.get("model_type", "Segmentor"))
-    if kind.lower() not in ("segmentor", "segmenter", "segmentation", "semantic-segmentation"):
+    if kind.lower() != "segmentor":
         raise ModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
     tile, channels_last = _tile_of(model, told)
     names = told.get("classes", {})
     output = _choose_output(model, class_name)
     gives_classes = output.kind in _WHOLE and _n_channels(output) in (None, 1)
-    channels = (_choose_classes if gives_classes else _choose_channels)(output, names, class_name)
+    channels = _choose(output, gives_classes, names, class_name)
     resolution = told.get("resolution_m")
     if resolution is not None and not 0.01 <= resolution <= 100:
         raise ValueError(f"a resolution of {resolution:g} m per pixel")
@@ -190,41 +190,26 @@ def channels_come_last(sides: Sequence[int | None]) -> bool:
     return sides[2] is not None and all(side is None or side > sides[2] for side in sides[:2])
 
 
-def _choose_channels(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
-    """Return which channels of an output are road."""
-    n, wanted = _n_channels(output), _wanted(names, class_name)
-    unnamed = not names and class_name in (None, output.name)
-    # A single channel is by convention the last of the classes, separated from the others by the threshold.
-    if n == 1 and (unnamed or max(names, default=0) in wanted):
-        return (0,)
-    if n == 1 or not wanted or (n is not None and max(wanted) >= n):
-        raise ModelError(_ask(names, class_name))
-    return tuple(wanted)
-
-
-def _choose_classes(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
-    """Return which values of an output are road; nothing where the model does not state it: all but 0 then."""
-    if not names and class_name in (None, output.name):
-        return ()
-    is_number = not names and str(class_name).isdecimal()
-    wanted = [int(str(class_name))] if is_number else _wanted(names, class_name)
-    if not wanted:
-        raise ModelError(_ask(names, class_name))
-    return tuple(wanted)
-
-
-def _wanted(names: dict[int, str], class_name: str | None) -> list[int]:
-    """Return the numbers of the classes that are road: by the given name, else by names of roads."""
+def _choose(output: Port, gives_classes: bool, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
+    """Return which channels, or which values of classes, are road; of classes without names none: all but 0 then."""
+    n, unnamed = _n_channels(output), not names and class_name in (None, output.name)
     if class_name is None:
-        return [key for key, name in names.items() if _is_road(name)]
-    return [key for key, name in names.items() if class_name in (name, str(key))]
-
-
-def _ask(names: dict[int, str], class_name: str | None) -> str:
-    listed = ", ".join(f"{key} {name}" for key, name in sorted(names.items())) or "none"
-    if class_name is None:
-        return f"names no class after roads (its classes: {listed}); say which shows them: --class NAME"
-    return f"has no class {class_name!r} (its classes: {listed}); choose one of them: --class NAME"
+        wanted = [key for key, name in names.items() if _is_road(name)]
+    else:
+        wanted = [key for key, name in names.items() if class_name in (name, str(key))]
+    if gives_classes:
+        wanted = [int(class_name)] if not names and class_name and class_name.isdecimal() else wanted
+        fits = bool(wanted) or unnamed
+    elif n == 1:  # by convention the last of the classes, separated from the others by the threshold
+        fits, wanted = unnamed or max(names, default=0) in wanted, [0]
+    else:
+        fits = bool(wanted) and (n is None or max(wanted) < n)
+    if not fits:
+        listed = ", ".join(f"{key} {name}" for key, name in sorted(names.items())) or "none"
+        what = "names no class after roads" if class_name is None else f"has no class {class_name!r}"
+        hint = "say which shows them" if class_name is None else "choose one of them"
+        raise ModelError(f"{what} (its classes: {listed}); {hint}: --class NAME")
+    return tuple(wanted)
 
 
 def _is_road(name: str) -> bool:
@@ -241,8 +226,8 @@ def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
         "resolution": ("resolution_m", lambda centimetres: float(centimetres) / 100.0),
         "tile_size": ("tile", int),
         "tiles_size": ("tile", int),
-        "standardization_mean": ("mean", lambda one: one),
-        "standardization_std": ("std", lambda one: one),
+        "standardization_mean": ("mean", lambda values: values),
+        "standardization_std": ("std", lambda values: values),
         "tiles_overlap": ("overlap", lambda percent: float(percent) / 100.0),
         "seg_thresh": ("threshold", float),
         "ways": ("ways", int),
@@ -283,11 +268,9 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
     told = _read_scaling(inputs[0])
     tasks = outputs[0].get("tasks") or properties.get("mlm:tasks") or []
     if tasks:
-        told["model_type"] = next((one for one in tasks if "segmentation" in one), tasks[0])
-        told["model_type"] = "Segmentor" if "segmentation" in told["model_type"] else told["model_type"]
-    classes = outputs[0].get("classification:classes", outputs[0].get("classification_classes"))
-    if classes:
-        told["classes"] = {int(one.get("value", i)): str(one["name"]) for i, one in enumerate(classes)}
+        told["model_type"] = next(("Segmentor" for task in tasks if "segmentation" in task), tasks[0])
+    if classes := outputs[0].get("classification:classes"):
+        told["classes"] = {int(each["value"]): str(each["name"]) for each in classes}
     if "gsd" in properties:
         told["resolution_m"] = float(properties["gsd"])
     shape = inputs[0].get("input", {}).get("shape", [])
@@ -296,22 +279,17 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
     return told
 
 
-def _read_scaling(one: dict[str, Any]) -> dict[str, Any]:
+def _read_scaling(described: dict[str, Any]) -> dict[str, Any]:
     """Turn MLM's scaling of 8-bit values, a chain of affine maps, into mean and deviation of values up to 1."""
-    scaling = one.get("value_scaling")
-    if not scaling:
-        statistics = one.get("statistics") or []
-        if one.get("norm_type") != "z-score" or not statistics:
-            return {}
-        scaling = [{"type": "z-score", **each} for each in statistics]
-    steps = scaling if isinstance(scaling, list) else [scaling]
+    steps = described.get("value_scaling") or []
+    steps = steps if isinstance(steps, list) else [steps]
     low, high = [], []  # images of 0 and 1 (that is, 255)
-    for each in steps if len(steps) == 3 else steps[:1] * 3:
-        shift, divisor = _affine(each)
+    for step in steps if len(steps) == 3 else steps[:1] * 3:
+        shift, divisor = _affine(step)
         unit = 1.0 if abs(shift) <= 1.5 and divisor <= 1.5 else 255.0
         low.append(shift / unit)
         high.append(divisor / unit)
-    return {"mean": low, "std": high}
+    return {"mean": low, "std": high} if low else {}
 
 
 def _affine(step: dict[str, Any]) -> tuple[float, float]:
@@ -320,7 +298,7 @@ def _affine(step: dict[str, Any]) -> tuple[float, float]:
     if kind is None:
         return 0.0, 1.0
     if kind == "z-score":
-        return float(step["mean"]), float(step.get("stddev", step.get("std", 1.0)))
+        return float(step["mean"]), float(step["stddev"])
     if kind == "min-max":
         return float(step["minimum"]), float(step["maximum"]) - float(step["minimum"])
     if kind == "scale":
