@@ -69,11 +69,6 @@ class _Answer(NamedTuple):
     places: Sequence[tuple[float, str]]
     parts: Sequence[str]
 
-    @property
-    def seconds(self) -> float:
-        """Time of the search alone, without the time in which it waited for the worker, and opened maps."""
-        return self.location.seconds.match + self.location.seconds.refine
-
 
 def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> Iterator[Outcome]:
     """Locate masks on a map that is divided among workers; yield the outcomes in order.
@@ -125,15 +120,15 @@ def _locate(
         Workers died of it, one after another, or the scheduler went away.
     """
     query = read_query(mask)
-    left_s = options.search.time_limit_s - query.seconds.vectorize
-    workers = sorted(client.nthreads()) or [""]
+    # Each of the three searches may take the time limit: waiting for a worker that is busy with other masks is no part.
+    limits = replace(options.search, time_limit_s=max(options.search.time_limit_s - query.seconds.vectorize, 0.0))
+    options, workers = replace(options, search=limits), sorted(client.nthreads()) or [""]
 
     def search(worker: str, parts: Sequence[str], options: LocateOptions) -> Future[_Answer]:
         here = sum(sizes[name] for name in parts)
         against = 2.0 * math.log10(larger(sum(sizes.values())) / larger(here))  # as in `Rivals`, for the whole map
-        limits = replace(options.search, time_limit_s=max(left_s, 0.0))
         pool = client.get_executor(pure=False, workers=[worker], allow_other_workers=True)
-        future: Future[_Answer] = pool.submit(do_prepared, made, query, parts, replace(options, search=limits), against)
+        future: Future[_Answer] = pool.submit(do_prepared, made, query, parts, options, against)
         return future
 
     def search_all(options: LocateOptions) -> list[_Answer]:
@@ -143,10 +138,8 @@ def _locate(
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
     try:
         answers = search_all(replace(options, effort="quick", search=least_work))
-        left_s -= max(answer.seconds for answer in answers)
         if not any(answer.location.located for answer in answers):
             answers = search_all(options)
-            left_s -= max(answer.seconds for answer in answers)
         best = max(answers, key=_rank)
         if best.location.status == "not_located":
             return _refused_by_all(best.location, [answer.location for answer in answers], references)

@@ -292,7 +292,7 @@ def test_what_is_seen_is_shown_without_a_map(
     drawn = cv2.imread(str(tmp_path / "seen" / "flight_vectorized.png"))
     assert drawn.shape == image.shape
     far = cv2.distanceTransform(np.uint8(image.max(axis=2) < 200), cv2.DIST_L2, 3) > 20
-    assert np.abs(drawn[far] - 0.8 * image[far]).mean() < 3  # the photograph itself
+    assert np.corrcoef(drawn[far].ravel(), image[far].ravel())[0, 1] > 0.9  # the photograph itself, faded
 
 
 def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> None:
