@@ -17,7 +17,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.evaluation.scoring import share
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.outputs.drawing.layers import Layer, Lines, Picture
+from roadgeo.outputs.drawing.layers import Layer, Lines, Picture, rgb
 from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_scale_bar, write_text
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.qml import draw_palette
@@ -335,7 +335,7 @@ def to_qml() -> str:
 
 def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str, longer_px: int = 1400) -> AnyArray:
     """Draw the map over its roads, with legend and scale: (height, width, 3) uint8, red, green, blue."""
-    grid, colors = found.grid, {value: (*_rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
+    grid, colors = found.grid, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
     rows, columns = found.classes.shape
     box = (0.0, 0.0, columns * grid.cell_m, rows * grid.cell_m)
     canvas = Canvas.of(box, longer_px, longer_px)
@@ -355,8 +355,3 @@ def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: s
         x = write_text(picture, label, (x + 24, 69), 17, INK) + 28
     write_text(picture, str(network.meta.get("attribution") or ""), (10, len(picture) - 11), 16, FAINT)
     return picture
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue

@@ -35,13 +35,18 @@ def write_gcps(path: Path, subject: Subject) -> None:
 
     with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
         vrt = Path(folder) / "gcps.vrt"
-        write_vrt(vrt, subject)
+        _write_vrt(vrt, subject, Path(folder))
         with open_raster(vrt, is_ours=True) as source, writing_raster(path):
             rasterio.shutil.copy(source, path, driver="GTiff", compress="DEFLATE", tiled=True, bigtiff="IF_SAFER")
 
 
 def write_vrt(path: Path, subject: Subject) -> None:
     """Write the control points as a GDAL virtual raster, which refers to the picture where it lies."""
+    _write_vrt(path, subject, subject.paths.folder)  # `path` itself is staged in another folder
+
+
+def _write_vrt(path: Path, subject: Subject, folder: Path) -> None:
+    """Write the virtual raster as it is read in a folder."""
     import rasterio.shutil
 
     from roadgeo.storage.rasters import open_raster, writing_raster
@@ -54,7 +59,7 @@ def write_vrt(path: Path, subject: Subject) -> None:
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()
     for source in root.iter("SourceFilename"):
-        source.text, relative = _from_here(subject.picture, path)
+        source.text, relative = _from_here(subject.picture, folder)
         source.set("relativeToVRT", relative)
     for name in ("SRS", "GeoTransform", "GCPList"):
         for element in root.findall(name):
@@ -68,11 +73,11 @@ def write_vrt(path: Path, subject: Subject) -> None:
     document.write(path, encoding="unicode")
 
 
-def _from_here(picture: Path, path: Path) -> tuple[str, str]:
-    """Return where a picture lies as seen from a file that names it, and "1"; on another drive its own path and "0"."""
+def _from_here(picture: Path, folder: Path) -> tuple[str, str]:
+    """Return where a picture lies as seen from a folder, and "1"; on another drive its own path and "0"."""
     there = Path(os.path.realpath(picture.parent), picture.name)
     try:
-        return os.path.relpath(there, os.path.realpath(path.parent)), "1"
+        return os.path.relpath(there, os.path.realpath(folder)), "1"
     except ValueError:
         return str(there), "0"
 

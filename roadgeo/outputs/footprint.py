@@ -13,6 +13,7 @@ from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.warping import warp
+from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.orthophoto import COMPRESSION, warp_image
 from roadgeo.outputs.subject import Subject
@@ -87,7 +88,7 @@ def _write_mask(path: Path, subject: Subject) -> None:
         optimized = stack.enter_context(rasterio.MemoryFile(ext="tif"))
         plain = stack.enter_context(rasterio.open("", "w", **profile))
         plain.write(warp_mask(subject)[None])
-        plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
+        plain.write_colormap(1, {value: (*rgb(color), 255) for value, (color, _, _) in PALETTE.items()})
         plain.update_tags(**_tags(subject))
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.
         plain.build_overviews(_reductions(max(grid.width, grid.height)), Resampling.nearest)
@@ -113,11 +114,6 @@ def _labels(mask: RoadMask) -> AnyArray:
     if mask.observed is not None:
         labels[~mask.observed] = OUTSIDE
     return labels
-
-
-def _rgba(color: str) -> tuple[int, int, int, int]:
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue, 255
 
 
 def _tags(subject: Subject) -> dict[str, str]:

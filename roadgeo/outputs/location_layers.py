@@ -11,6 +11,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.location import Evidence, Location
 from roadgeo.outputs.columns import attributes
+from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.geopackage import Layer, dump_layers
@@ -18,11 +19,13 @@ from roadgeo.storage.qml import draw_arrow, draw_fill, draw_line, draw_marker
 
 __all__ = ["write_geopackage"]
 
-_FOOTPRINT_STYLE = draw_fill("31,111,180,20", "31,111,180", 0.7)
-_ROADS_STYLE = draw_line("228,87,46", 0.5)
-_MATCHES_STYLE = draw_marker("27,38,59", 2.2)
-_RESIDUALS_STYLE = draw_arrow("27,38,59", 0.4)
-_CORNERS_STYLE = draw_marker("31,111,180", 1.8)
+#: Colours of pages and pictures, as QGIS writes them.
+_FRAME, _QUERY, _MATCH = (",".join(map(str, rgb(name))) for name in ("frame", "query", "match"))
+_FOOTPRINT_STYLE = draw_fill(f"{_FRAME},20", _FRAME, 0.7)
+_ROADS_STYLE = draw_line(_QUERY, 0.5)
+_MATCHES_STYLE = draw_marker(_MATCH, 2.2)
+_RESIDUALS_STYLE = draw_arrow(_MATCH, 0.4)
+_CORNERS_STYLE = draw_marker(_FRAME, 1.8)
 _ALTERNATIVES_STYLE = draw_marker("240,180,41", 3.0)
 
 _CORNERS = ("top left", "top right", "bottom right", "bottom left")
@@ -37,34 +40,34 @@ def write_geopackage(path: Path, subject: Subject) -> None:
 
 def _layers(subject: Subject) -> list[Layer]:
     place, evidence = subject.place, subject.location.evidence
-    layers = [
-        Layer(
-            "footprint",
-            "POLYGON",
-            [place.footprint],
-            {name: [value] for name, value in attributes(subject.location.to_dict()).items()},
-            place.crs,
-            _FOOTPRINT_STYLE,
-            "Ground that the image shows",
-        )
+    columns = {name: [value] for name, value in attributes(subject.location.to_dict()).items()}
+    text = "Ground that the image shows"
+    return [
+        Layer("footprint", "POLYGON", [place.footprint], columns, place.crs, _FOOTPRINT_STYLE, text),
+        *([] if evidence is None else _evidence_layers(place, evidence)),
+        _corner_layer(place, subject.location),
+        _alternative_layer(place, subject.location),
     ]
-    if evidence is not None:
-        layers += [_road_layer(place, evidence), _residual_layer(place, evidence), _match_layer(place, evidence)]
-    return [*layers, _corner_layer(place, subject.location), _alternative_layer(place, subject.location)]
 
 
-def _road_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Draw the mask's roads on the map."""
-    lines = place.map_roads(evidence.query_graph)
-    return Layer(
-        "query_roads",
-        "LINESTRING",
-        lines,
-        {"length_m": _lengths(lines)},
-        place.crs,
-        _ROADS_STYLE,
+def _evidence_layers(place: Placement, evidence: Evidence) -> list[Layer]:
+    """Draw the mask's roads on the map, its matched intersections where the map has them, and the way between both."""
+    lines, pixels = place.map_roads(evidence.query_graph), plane_to_pixel(evidence.query_xy)
+    start, end = place.to_crs(pixels), evidence.reference_xy
+    arrows = list(np.stack([start, start + _EXAGGERATION * (end - start)], axis=1))
+    apart = {"residual_m": evidence.residual_m, "dx_m": end[:, 0] - start[:, 0], "dy_m": end[:, 1] - start[:, 1]}
+    where = {"column": pixels[:, 0], "row": pixels[:, 1]}
+    texts = (
         "Roads of the mask, as vectorized",
+        f"From the mask's intersections towards the map's, {_EXAGGERATION:g} times as long as the residuals are",
+        "Intersections found both in the mask and on the map",
     )
+    length = {"length_m": _lengths(lines)}
+    return [
+        Layer("query_roads", "LINESTRING", lines, length, place.crs, _ROADS_STYLE, texts[0]),
+        Layer("residuals", "LINESTRING", arrows, apart, place.crs, _RESIDUALS_STYLE, texts[1]),
+        Layer("matches", "POINT", end, {**where, **apart}, place.crs, _MATCHES_STYLE, texts[2]),
+    ]
 
 
 def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
@@ -75,43 +78,6 @@ def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
     steps = np.hypot(*np.diff(np.concatenate(lines), axis=0).T)
     steps[starts[1:-1] - 1] = 0.0  # from one line to the next
     return np.asarray(np.add.reduceat(steps, starts[:-1]))
-
-
-def _match_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Show matched intersections where the map has them, with the way from the mask's to the map's."""
-    pixels = plane_to_pixel(evidence.query_xy)
-    offset = evidence.reference_xy - place.to_crs(pixels)
-    columns = {
-        "column": pixels[:, 0],
-        "row": pixels[:, 1],
-        "residual_m": evidence.residual_m,
-        "dx_m": offset[:, 0],
-        "dy_m": offset[:, 1],
-    }
-    return Layer(
-        "matches",
-        "POINT",
-        evidence.reference_xy,
-        columns,
-        place.crs,
-        _MATCHES_STYLE,
-        "Intersections found both in the mask and on the map",
-    )
-
-
-def _residual_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Draw from each of the mask's matched intersections towards the map's, exaggerated."""
-    start = place.to_crs(plane_to_pixel(evidence.query_xy))
-    offset = evidence.reference_xy - start
-    return Layer(
-        "residuals",
-        "LINESTRING",
-        list(np.stack([start, start + _EXAGGERATION * offset], axis=1)),
-        {"residual_m": evidence.residual_m, "dx_m": offset[:, 0], "dy_m": offset[:, 1]},
-        place.crs,
-        _RESIDUALS_STYLE,
-        f"From the mask's intersections towards the map's, {_EXAGGERATION:g} times as long as the residuals are",
-    )
 
 
 def _corner_layer(place: Placement, location: Location) -> Layer:
@@ -135,17 +101,13 @@ def _corner_layer(place: Placement, location: Location) -> Layer:
 def _alternative_layer(place: Placement, location: Location) -> Layer:
     """Show where else the mask might lie."""
     others = location.alternatives
-    return Layer(
-        "alternatives",
-        "POINT",
-        np.array([(other.x, other.y) for other in others], float).reshape(-1, 2),
-        {
-            "rank": np.arange(2, 2 + len(others)),
-            "log10_odds": np.array([other.log10_odds for other in others], float),
-            "lon": np.array([other.lon for other in others], float),
-            "lat": np.array([other.lat for other in others], float),
-        },
-        place.crs,
-        _ALTERNATIVES_STYLE,
-        "Middles of the best other places, with their odds",
-    )
+    values = np.array([(other.x, other.y, other.log10_odds, other.lon, other.lat) for other in others], float)
+    values = values.reshape(-1, 5)
+    columns = {
+        "rank": np.arange(2, 2 + len(others)),
+        "log10_odds": values[:, 2],
+        "lon": values[:, 3],
+        "lat": values[:, 4],
+    }
+    text = "Middles of the best other places, with their odds"
+    return Layer("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)

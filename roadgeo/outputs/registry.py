@@ -13,7 +13,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from roadgeo.errors import PluginError
 
@@ -72,91 +72,64 @@ class Output:
         return folder / (self.ending.replace("{picture}", picture) if "{" in self.ending else stem + self.ending)
 
 
-def _by(module: str, function: str) -> Callable[[Path, Subject], None]:
-    """Return a writer that imports its module of this package at its first call."""
+def _own(name: str, ending: str, writer: str, summary: str, **more: Any) -> Output:
+    """Return an output of this package; `writer` is "module.function", imported when something is written."""
+    module, _, function = writer.rpartition(".")
 
     def write(path: Path, subject: Subject) -> None:
         getattr(importlib.import_module(f"roadgeo.outputs.{module}"), function)(path, subject)
 
-    return write
+    return Output(name, ending, write, summary, **more)
 
 
-JSON = Output(
-    "json",
-    "_location.json",
-    _by("location_files", "write_json"),
-    "place, homography, odds; also written, with a reason, where nothing was found",
-    needs_place=False,
-)
-FOOTPRINT = Output(
-    "footprint",
-    "_footprint.tif",
-    _by("footprint", "write_footprint"),
+JSON = _own(
+    "json", "_location.json", "location_files.write_json",
+    "place, homography, odds; also written, with a reason, where nothing was found", needs_place=False,
+)  # fmt: skip
+FOOTPRINT = _own(
+    "footprint", "_footprint.tif", "footprint.write_footprint",
     "the mask, or its --image, on the map (Cloud Optimized GeoTIFF)",
-)
-STYLE = Output("style", "_footprint.qml", _by("footprint", "write_style"), "how QGIS draws a mask's footprint")
-GEOPACKAGE = Output(
-    "geopackage",
-    "_location.gpkg",
-    _by("location_layers", "write_geopackage"),
+)  # fmt: skip
+STYLE = _own("style", "_footprint.qml", "footprint.write_style", "how QGIS draws a mask's footprint")
+GEOPACKAGE = _own(
+    "geopackage", "_location.gpkg", "location_layers.write_geopackage",
     "footprint, matched intersections, roads: opens styled in QGIS",
+)  # fmt: skip
+OVERLAY = _own(
+    "overlay", "_overlay.png", "overlay.write_overlay", "the mask and its place, to look at", option="--plot"
 )
-OVERLAY = Output(
-    "overlay", "_overlay.png", _by("overlay", "write_overlay"), "the mask and its place, to look at", option="--plot"
-)
-REPORT = Output(
-    "report",
-    "_report.html",
-    _by("report.page", "write_report"),
-    "map, mask, residuals and numbers; also where nothing was found",
-    needs_place=False,
-    option="--report",
-)
-EXPLANATION = Output(
-    "explanation",
-    "_explain.json",
-    _by("explanation_sheet", "write_explanation"),
-    "the same for programs",
-    needs_place=False,
-    option="--explain",
-)
-EXPLANATION_PICTURE = Output(
-    "explanation-picture",
-    "_explain.png",
-    _by("explanation_sheet", "write_explanation_picture"),
-    "why it was found there, or nowhere",
-    needs_place=False,
-    option="--explain",
-)
+REPORT = _own(
+    "report", "_report.html", "report.page.write_report",
+    "map, mask, residuals and numbers; also where nothing was found", needs_place=False, option="--report",
+)  # fmt: skip
+EXPLANATION = _own(
+    "explanation", "_explain.json", "explanation_sheet.write_explanation", "the same for programs",
+    needs_place=False, option="--explain",
+)  # fmt: skip
+EXPLANATION_PICTURE = _own(
+    "explanation-picture", "_explain.png", "explanation_sheet.write_explanation_picture",
+    "why it was found there, or nowhere", needs_place=False, option="--explain",
+)  # fmt: skip
 
-GCPS = Output(
-    "gcps", "_gcps.tif", _by("control_points", "write_gcps"), "the picture's own pixels with 25 control points, GeoTIFF"
-)
-VRT = Output(
-    "vrt", "_gcps.vrt", _by("control_points", "write_vrt"), "the same as a GDAL virtual raster: no pixels are copied"
-)
-POINTS = Output(
-    "points", "{picture}.points", _by("control_points", "write_points"), "control points for the QGIS Georeferencer"
-)
-MATCHES = Output(
-    "matches",
-    "_matches.csv",
-    _by("control_points", "write_matches"),
+GCPS = _own(
+    "gcps", "_gcps.tif", "control_points.write_gcps",
+    "the picture's own pixels with 25 control points, GeoTIFF",
+)  # fmt: skip
+VRT = _own("vrt", "_gcps.vrt", "control_points.write_vrt", "the same as a GDAL virtual raster: no pixels are copied")
+POINTS = _own("points", "{picture}.points", "control_points.write_points", "control points for the QGIS Georeferencer")
+MATCHES = _own(
+    "matches", "_matches.csv", "control_points.write_matches",
     "the matched intersections, in pixels and on the map, with residuals (CSV)",
-)
-MATCH_POINTS = Output(
-    "match-points",
-    "{picture}_matches.points",
-    _by("control_points", "write_match_points"),
+)  # fmt: skip
+MATCH_POINTS = _own(
+    "match-points", "{picture}_matches.points", "control_points.write_match_points",
     "the matched intersections for the QGIS Georeferencer, with residuals",
-)
-ODM = Output("odm", "_gcp_list.txt", _by("control_points", "write_odm"), "control points for OpenDroneMap")
-WORLD_FILE = Output(
-    "worldfile", "_footprint.tfw", _by("footprint", "write_world_file"), "world file of the drawn raster"
-)
-GEOJSON = Output("geojson", "_footprint.geojson", _by("outlines", "write_geojson"), "footprint as GeoJSON (RFC 7946)")
-STAC = Output("stac", "_stac.json", _by("outlines", "write_stac"), "STAC Item of the drawn raster")
-KMZ = Output("kmz", "_overlay.kmz", _by("kmz", "write_kmz"), "ground overlay for Google Earth")
+)  # fmt: skip
+ODM = _own("odm", "_gcp_list.txt", "control_points.write_odm", "control points for OpenDroneMap")
+WORLD_FILE = _own("worldfile", "_footprint.tfw", "footprint.write_world_file", "world file of the drawn raster")
+GEOJSON = _own("geojson", "_footprint.geojson", "outlines.write_geojson", "footprint as GeoJSON (RFC 7946)")
+STAC = _own("stac", "_stac.json", "outlines.write_stac", "STAC Item of the drawn raster")
+KMZ = _own("kmz", "_overlay.kmz", "kmz.write_kmz", "ground overlay for Google Earth")
 
 #: Written for every located mask; of these only the JSON where there is no place.
 ALWAYS = (JSON, FOOTPRINT, STYLE, GEOPACKAGE)

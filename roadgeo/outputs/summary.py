@@ -12,6 +12,7 @@ import numpy as np
 
 from roadgeo.geometry.antimeridian import cut_ring
 from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
+from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.names import bare_names, table_cell
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
@@ -19,7 +20,8 @@ from roadgeo.storage.qml import draw_fill
 
 __all__ = ["write_summary"]
 
-_STYLE = draw_fill("31,111,180,40", "31,111,180", 0.5)
+_FRAME = ",".join(map(str, rgb("frame")))
+_STYLE = draw_fill(f"{_FRAME},40", _FRAME, 0.5)
 
 
 def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[Path]:

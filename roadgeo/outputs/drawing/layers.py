@@ -42,9 +42,9 @@ PALETTE = {
 }
 
 
-def rgb(name: str) -> Color:
-    """Return red, green and blue of a colour of the palette, as on light screens."""
-    red, green, blue = bytes.fromhex(PALETTE[name][0].removeprefix("#"))
+def rgb(color: str) -> Color:
+    """Return red, green and blue of a colour, "#rrggbb" or one in the palette, as on light screens."""
+    red, green, blue = bytes.fromhex(PALETTE.get(color, (color,))[0].removeprefix("#"))
     return red, green, blue
 
 
