@@ -60,7 +60,7 @@ def test_what_a_weak_look_proposed_is_found_by_ground_that_comes_later(flown):
 
 def test_each_search_takes_its_share_off(flown):
     first, again = Candidates([flown[2]]), Candidates([flown[2]], n_looks=9)
-    odds = [one.look(look_at(flown, 6, True), LocateOptions()).log10_odds for one in (first, again)]
+    odds = [item.look(look_at(flown, 6, True), LocateOptions()).log10_odds for item in (first, again)]
     assert odds[0] - odds[1] == pytest.approx(1.0)
     assert (first.n_looks, again.n_looks) == (1, 10)
     before = first.look(look_at(flown, 6, False), LocateOptions()).log10_odds
@@ -70,12 +70,12 @@ def test_each_search_takes_its_share_off(flown):
 
 def test_no_more_than_so_many_places_are_kept_those_that_explain_most(flown):
     all_of_them, few = Candidates([flown[2]]), Candidates([flown[2]], CandidateOptions(most=3))
-    for one in (all_of_them, few):
-        one.look(look_at(flown, 4, True), weak())
-    worth = sorted((one.fit.log10_likelihood for one in all_of_them._kept), reverse=True)
+    for entry in (all_of_them, few):
+        entry.look(look_at(flown, 4, True), weak())
+    worth = sorted((item.fit.log10_likelihood for item in all_of_them._kept), reverse=True)
     assert len(all_of_them) <= 2 * CandidateOptions().per_look  # of a quick search, and of a full one
     assert len(few) == 3
-    assert [one.fit.log10_likelihood for one in few._kept] == pytest.approx(worth[:3])
+    assert [item.fit.log10_likelihood for item in few._kept] == pytest.approx(worth[:3])
 
 
 def test_the_best_place_is_compared_with_all_others(flown):
@@ -83,7 +83,7 @@ def test_the_best_place_is_compared_with_all_others(flown):
     candidates, look = Candidates([flown[2]]), look_at(flown, 8, True)
     location = candidates.look(look, LocateOptions())
     assert location.located
-    worth = sorted((one.fit.log10_likelihood for one in candidates._kept), reverse=True)
+    worth = sorted((item.fit.log10_likelihood for item in candidates._kept), reverse=True)
     assert location.log10_odds < worth[0]
 
 

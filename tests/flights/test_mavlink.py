@@ -47,10 +47,10 @@ def test_a_peer_decodes_what_was_sent():
         # Delay: from when the frame was taken to when the place was sent.
         assert 0.25 <= command["param2"] < 0.75
         assert math.isclose(place["processing_time"] / 1e6, command["param2"], abs_tol=1e-4)
-    sent = [one["param1"] for one in commands]
+    sent = [item["param1"] for item in commands]
     assert sent == sorted(sent)
     assert of_kind(heard, "HEARTBEAT")
-    assert {one["src"] for one in heard} == {197}
+    assert {item["src"] for item in heard} == {197}
 
 
 @needs
@@ -73,7 +73,7 @@ def test_losses_are_seen_by_the_peer_and_the_rest_arrives():
     assert 20 <= len(places) < 30
     assert heard[-1]["lost"] > 0
     sent = {round(fix.lat * 1e7) for fix in fixes}
-    assert {one["lat"] for one in places} <= sent
+    assert {place["lat"] for place in places} <= sent
 
 
 @needs

@@ -42,7 +42,7 @@ def test_roads_that_one_frame_misses_are_taken_from_others():
     roads[:, 150:170] = True
     broken = roads.copy()
     broken[100:200] = False
-    masks = [RoadMask(one) for one in (roads, broken, roads, roads)]
+    masks = [RoadMask(item) for item in (roads, broken, roads, roads)]
     mosaic = lay_together(masks, motion, 20.0, MosaicOptions(road_px=20.0))
     assert mosaic is not None
     for k, matrix in enumerate(mosaic.to_mosaic):

@@ -45,9 +45,9 @@ def test_photographs_tell_it_to_a_pixel():
 
 def test_photographs_of_other_places_tell_nothing():
     rng = np.random.default_rng(1)
-    one, other = rng.integers(0, 255, (2, 240, 320)).astype(np.uint8)
-    assert between_images(one, other) is None
-    assert between_images(np.zeros((240, 320), np.uint8), one) is None
+    first, other = rng.integers(0, 255, (2, 240, 320)).astype(np.uint8)
+    assert between_images(first, other) is None
+    assert between_images(np.zeros((240, 320), np.uint8), first) is None
 
 
 def streets():

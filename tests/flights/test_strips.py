@@ -31,8 +31,10 @@ def strip(town):
 def errors(tracked, flight):
     """How far each frame's middle lies from the truth, metres."""
     return [
-        np.hypot(*(one.pose.center - flight.views[int(one.frame.name)].homography(one.frame.frame.center)))
-        for one in tracked
+        np.hypot(
+            *(sighting.pose.center - flight.views[int(sighting.frame.name)].homography(sighting.frame.frame.center))
+        )
+        for sighting in tracked
     ]
 
 
@@ -43,10 +45,10 @@ def shuffled(masks):
 @pytest.mark.slow
 def test_masks_in_no_order_are_placed_in_that_of_the_strip(strip):
     flight, masks, reference = strip
-    tracked = place_strips([(one, None) for one in shuffled(masks)], [reference])
-    assert {one.status for one in tracked} == {"located"}
-    assert [one.frame.name for one in tracked] == ["0", "1", "2", "3", "4", "5"]
-    assert [one.frame.number for one in tracked] == list(range(6))
+    tracked = place_strips([(item, None) for item in shuffled(masks)], [reference])
+    assert {sighting.status for sighting in tracked} == {"located"}
+    assert [sighting.frame.name for sighting in tracked] == ["0", "1", "2", "3", "4", "5"]
+    assert [sighting.frame.number for sighting in tracked] == list(range(6))
     assert max(errors(tracked, flight)) < 4.0
 
 
@@ -57,9 +59,9 @@ def test_a_frame_that_was_scanned_upside_down_and_one_from_elsewhere(strip):
     other[240:250] = other[:, 100:110] = other[:, 400:410] = True
     turned = [RoadMask(masks[2].roads[::-1, ::-1].copy()) if k == 2 else mask for k, mask in enumerate(masks)]
     frames = [*shuffled(turned), FlightFrame(6, "elsewhere", 6.0, RoadMask(other))]
-    tracked = place_strips([(one, None) for one in frames], [reference])
-    assert [one.frame.name for one in tracked if one.status == "lost"] == ["elsewhere"]
-    placed = [one for one in tracked if one.status == "located"]
+    tracked = place_strips([(frame, None) for frame in frames], [reference])
+    assert [sighting.frame.name for sighting in tracked if sighting.status == "lost"] == ["elsewhere"]
+    placed = [sighting for sighting in tracked if sighting.status == "located"]
     assert len(placed) == 6
     assert max(errors(placed, flight)) < 4.0
 
@@ -79,8 +81,8 @@ def test_pictures_link_frames_that_their_roads_do_not(strip):
     bare = [RoadMask(mask.roads & (np.arange(500) % 250 < 150)) for mask in masks]  # stripes without any road
     frames = [(FlightFrame(n, str(k), float(n), bare[k]), greys[k]) for n, k in enumerate(ORDER)]
     tracked = place_strips(frames, [reference])
-    assert [one.frame.name for one in tracked] == ["0", "1", "2", "3", "4", "5"]
-    assert all(one.status != "lost" for one in tracked)
+    assert [sighting.frame.name for sighting in tracked] == ["0", "1", "2", "3", "4", "5"]
+    assert all(sighting.status != "lost" for sighting in tracked)
     assert max(errors(tracked, flight)) < 6.0
 
 
@@ -115,8 +117,8 @@ def test_all_links_are_heeded_and_one_that_contradicts_the_others_is_not():
     def worst(found):
         to_truth = truth[net[0]] @ np.linalg.inv(found[0])
         return max(
-            np.abs(Homography(to_truth @ one)(frame.corners) - Homography(truth[k])(frame.corners)).max()
-            for k, one in zip(net, found, strict=True)
+            np.abs(Homography(to_truth @ result)(frame.corners) - Homography(truth[k])(frame.corners)).max()
+            for k, result in zip(net, found, strict=True)
         )
 
     assert worst(matrices) < 6.0

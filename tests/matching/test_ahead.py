@@ -79,4 +79,4 @@ def test_kernels_let_other_threads_run():
     ended = time.perf_counter()
     done.set()
     other.join()
-    assert sum(started < one < ended for one in ticks) >= 3
+    assert sum(started < item < ended for item in ticks) >= 3

@@ -115,8 +115,8 @@ def test_without_any_nothing_changes(town):
     given, nothing = fit(truth, scene, town[1]), np.full(len(scene.intersections), -1)
     alone = replace(scene, points=scene.points[:1], directions=scene.directions[:1], weights=scene.weights[:1])
     none = replace(alone, points=np.empty((0, 2)), directions=np.empty((0, 2)), weights=np.empty(0))
-    for one in (alone, none):
-        assert between_carriageways(truth, one, town[1], nothing) == (one, nothing)
+    for item in (alone, none):
+        assert between_carriageways(truth, item, town[1], nothing) == (item, nothing)
     found, _ = refine_between(given, scene, town[1], nothing, RefineOptions())
     assert error_of(found.matrix, truth, scene) < error_of(given.matrix, truth, scene) + 0.05
 
@@ -156,8 +156,8 @@ def test_the_nearest_of_some_points(n, m, away, seed):
     xy, points = rng.uniform(0, 100, (n, 2)), rng.uniform(0, 100, (m, 2))
     among = np.flatnonzero(rng.random(m) < 0.5)
     found = nearest_of(xy, points, among, away)
-    for one, number in zip(xy, found, strict=True):
-        distances = np.hypot(*(points[among] - one).T)
+    for point, number in zip(xy, found, strict=True):
+        distances = np.hypot(*(points[among] - point).T)
         if len(among) and distances.min() < away:
             assert number == among[np.argmin(distances)]
         else:

@@ -105,9 +105,9 @@ def test_places_on_many_maps_are_bounded_as_on_one(town):
     options = MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=False)
     ledger = Ledger(n_reference=3 * len(town[1]))
     parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
-    search_together([Search(one) for one in parts], SearchOptions(time_limit_s=60.0))
-    assert ledger.n_tried == ledger.n_by_triples == sum(one.n_screened for one in parts)
-    assert 40 <= ledger.n_tried < 40 + max(one.n_screened for one in parts)
+    search_together([Search(part) for part in parts], SearchOptions(time_limit_s=60.0))
+    assert ledger.n_tried == ledger.n_by_triples == sum(part.n_screened for part in parts)
+    assert 40 <= ledger.n_tried < 40 + max(part.n_screened for part in parts)
 
 
 def test_more_anchors_are_tried_on_a_small_map(town, scene):

@@ -56,8 +56,8 @@ class TestPeak:
         assert weigh(town, scene) > weigh(town, scene, moved(TRUTH, scene, **move)) + 3.0
 
     def test_the_further_off_the_less_until_nothing_agrees(self, town, scene):
-        told = [weigh(town, scene, moved(TRUTH, scene, east=away)) for away in (0.0, 3.0, 6.0, 12.0)]
-        assert told == sorted(told, reverse=True)
+        values = [weigh(town, scene, moved(TRUTH, scene, east=away)) for away in (0.0, 3.0, 6.0, 12.0)]
+        assert values == sorted(values, reverse=True)
         assert weigh(town, scene, moved(TRUTH, scene, east=410.0, north=-333.0)) < 0.0
 
     def test_small_errors_of_the_corners_cost_something_too(self, town, scene):
@@ -71,15 +71,15 @@ class TestPeak:
 
 class TestCost:
     def test_exact_fits_explain_more_than_rough_ones(self, town):
-        told = [weigh(town, seen(town, sigma_m=sigma)) for sigma in (0.0, 1.0, 2.0, 4.0)]
-        assert told == sorted(told, reverse=True)
-        assert told[0] > 1.2 * told[2]
+        values = [weigh(town, seen(town, sigma_m=sigma)) for sigma in (0.0, 1.0, 2.0, 4.0)]
+        assert values == sorted(values, reverse=True)
+        assert values[0] > 1.2 * values[2]
 
     @pytest.mark.parametrize("kind", ["missing", "false"])
     def test_roads_that_one_lacks_cost_something_and_not_everything(self, town, kind):
-        told = [weigh(town, seen(town, sigma_m=0.5, **{kind: share})) for share in (0.0, 0.2, 0.4)]
-        assert told == sorted(told, reverse=True)
-        assert told[-1] > 0.3 * told[0] > 3.0
+        values = [weigh(town, seen(town, sigma_m=0.5, **{kind: share})) for share in (0.0, 0.2, 0.4)]
+        assert values == sorted(values, reverse=True)
+        assert values[-1] > 0.3 * values[0] > 3.0
 
     def test_a_query_of_strange_roads_is_worth_no_more_than_none(self, town):
         strange = scene_of(look(random_network(9, 4000.0), TRUTH, SIZE), SIZE)
@@ -98,8 +98,8 @@ class TestCost:
 
     def test_more_of_the_same_road_says_more(self, town, scene):
         small = seen(town, camera((2000, 1900), (450, 350), 1.0, 20.0, 50.0, 130.0), (450, 350), sigma_m=0.5)
-        told = weigh(town, small, camera((2000, 1900), (450, 350), 1.0, 20.0, 50.0, 130.0))
-        assert 0.0 < told < 0.5 * weigh(town, scene)
+        reported = weigh(town, small, camera((2000, 1900), (450, 350), 1.0, 20.0, 50.0, 130.0))
+        assert 0.0 < reported < 0.5 * weigh(town, scene)
 
     def test_nothing_seen_and_nothing_mapped_say_nothing_for_a_place(self, town, scene):
         empty = scene_of(look(town[0], np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1.0]]), SIZE), SIZE)
@@ -121,9 +121,9 @@ class TestScale:
         wide = random_network(4, 2000.0 * gsd_m, 120.0 * gsd_m)
         truth = camera((1000.0 * gsd_m, 1000.0 * gsd_m), gsd_m=gsd_m)
         scene, index = scene_of(look(wide, truth)), build_index(wide)
-        told = Evidence(scene, index, gsd_m).weigh(truth)
-        assert told > 12.0
-        assert Evidence(scene, index, gsd_m).nearby(truth) < 0.35 * told
+        reported = Evidence(scene, index, gsd_m).weigh(truth)
+        assert reported > 12.0
+        assert Evidence(scene, index, gsd_m).nearby(truth) < 0.35 * reported
 
 
 class TestShared:
@@ -180,8 +180,8 @@ class TestNearby:
         assert Evidence(scene, town[1], 1.0).nearby(moved(TRUTH, scene, east=1e6)) < 0.0
 
     def test_twice_the_same(self, town, scene):
-        one, other = Evidence(scene, town[1], 1.0), Evidence(scene, town[1], 1.0)
-        assert one.nearby(TRUTH) == other.nearby(TRUTH) == one.nearby(TRUTH)
+        first, other = Evidence(scene, town[1], 1.0), Evidence(scene, town[1], 1.0)
+        assert first.nearby(TRUTH) == other.nearby(TRUTH) == first.nearby(TRUTH)
 
 
 class TestArithmetic:
@@ -263,8 +263,8 @@ def test_a_lead_is_never_surer_than_all_ways_to_draw_the_signs_tell(drawn):
 
 
 def test_one_piece_outweighs_no_others():
-    told = np.append(np.linspace(1.0, 2.0, 30), -100.0)
-    assert log10_lead(told) > log10_lead(told[:-1]) - 1.5 > 4.0
+    reported = np.append(np.linspace(1.0, 2.0, 30), -100.0)
+    assert log10_lead(reported) > log10_lead(reported[:-1]) - 1.5 > 4.0
 
 
 def test_a_long_lead_is_counted_without_end():

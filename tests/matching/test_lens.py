@@ -98,7 +98,7 @@ def test_a_fit_grows_over_the_frame_where_a_fifth_of_the_roads_is_missing_and_tw
 
 
 def test_a_fit_begins_with_the_largest_part_that_lies_on_roads_not_with_a_small_one_that_does_by_chance():
-    x, y = (one.ravel() for one in np.meshgrid(np.arange(10.0, 1000.0, 20.0), np.arange(10.0, 1000.0, 20.0)))
+    x, y = (item.ravel() for item in np.meshgrid(np.arange(10.0, 1000.0, 20.0), np.arange(10.0, 1000.0, 20.0)))
     left, corner = x < 500, (x > 800) & (y < 200)
     met = np.where(left, (x + y) % 100 != 20, corner)  # four of five
     core = _core(met, np.stack((x, -y), axis=1), (1000, 1000))

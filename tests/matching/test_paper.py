@@ -159,15 +159,17 @@ def test_tuples_pass_equations_7_and_8(second, options, expected):
 def test_types_put_the_lesser_end_first():
     found = intersections(*zip(crossing(0, 0, 0, 60, 120), crossing(100, 100, 0, 90), strict=True))
     index = build_pair_index(found)
-    assert {key: one.pairs.tolist() for key, one in index.tuples.items()} == {(16 * 4 + 2) * 256 + 16 * 6 + 3: [[1, 0]]}
+    assert {key: item.pairs.tolist() for key, item in index.tuples.items()} == {
+        (16 * 4 + 2) * 256 + 16 * 6 + 3: [[1, 0]]
+    }
 
 
 def test_pairs_match_their_twin(reference, index):
     expected = naive.list_pairs(reference.xy, reference.tangents, 1000.0, math.radians(15))
-    assert {frozenset(p) for one in index.tuples.values() for p in one.pairs.tolist()} == expected
+    assert {frozenset(p) for item in index.tuples.values() for p in item.pairs.tolist()} == expected
     assert len(index) == len(expected)
-    for key, one in index.tuples.items():
-        assert (16 * reference.n_branches[one.pairs] + reference.n_tangents[one.pairs] == divmod(key, 256)).all()
+    for key, entry in index.tuples.items():
+        assert (16 * reference.n_branches[entry.pairs] + reference.n_tangents[entry.pairs] == divmod(key, 256)).all()
 
 
 def test_descriptors_match_their_twin(reference, index):
@@ -190,10 +192,10 @@ def test_candidates_are_those_within_the_relative_error(reference, index):
     checked = 0
     for (a, b), key in search.draw_query_tuples()[:60]:
         pairs, tree = index.tuples[key]
-        for one in search.correspondences(a, b, key) if tree is not None else []:
-            d_c = naive.describe_pairs([one.ends], query.xy, query.tangents)[0]
+        for correspondence in search.correspondences(a, b, key) if tree is not None else []:
+            d_c = naive.describe_pairs([correspondence.ends], query.xy, query.tangents)[0]
             expected = pairs[(np.abs(np.exp(tree.data) - d_c) < 0.3 * d_c).all(axis=1)]
-            np.testing.assert_array_equal(one.candidates, expected)
+            np.testing.assert_array_equal(correspondence.candidates, expected)
             checked += len(expected)
     assert checked > 100
 
@@ -282,7 +284,7 @@ def test_more_tangents_give_the_least_geometric_error():
         error = found - p[0] * query - p[1]
         return np.sum(error**2 / ((1 + found**2) ** 2 + (p[0] * (1 + query**2)) ** 2))
 
-    fitted = [float(one[0]) for one in fit_pencils(query, found[None])]
+    fitted = [float(fit_pencil[0]) for fit_pencil in fit_pencils(query, found[None])]
     best = minimize(sampson, (1.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-15})
     assert sampson(fitted) <= best.fun * 1.01
     np.testing.assert_allclose(fitted, best.x, atol=2e-3)

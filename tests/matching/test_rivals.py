@@ -43,10 +43,10 @@ def search_of(world, *matrices, near=None, match=None):
     return Search(estimator), estimator
 
 
-def stand(world, *matrices, n_reference=866, **told):
+def stand(world, *matrices, n_reference=866, **options):
     """Compare the likeliest of some places with the best other one."""
-    one, estimator = search_of(world, *matrices, **told)
-    return Rivals({one: estimator}, Ledger(n_reference=n_reference), NEEDED).standing(one)
+    item, estimator = search_of(world, *matrices, **options)
+    return Rivals({item: estimator}, Ledger(n_reference=n_reference), NEEDED).standing(item)
 
 
 def test_a_place_that_explains_too_little_to_be_laid_has_places_nearby_too(even):
@@ -145,14 +145,14 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
     others = similar_places(wrong, evidence, evidence.compared_with(wrong), MatchOptions())
     places = [other.matrix for other in others]
     assert 0 < len(places) <= rivals._AROUND.n_places
-    assert min(apart(broken, one) for one in places) < 3.0  # the place itself is among them
-    assert sum(apart(broken, one, wrong) > 500.0 for one in places) > 1
+    assert min(apart(broken, place) for place in places) < 3.0  # the place itself is among them
+    assert sum(apart(broken, place, wrong) > 500.0 for place in places) > 1
     size = evidence.scene.size
-    for one in places:
-        assert np.linalg.det(one) > 0.0
-        assert sampling(one, size) == pytest.approx(sampling(wrong, size), rel=0.1)
-        assert evidence.weigh(one) > 0.0
-    assert [other.worth for other in others] == pytest.approx([evidence.weigh(one) for one in places])
+    for item in places:
+        assert np.linalg.det(item) > 0.0
+        assert sampling(item, size) == pytest.approx(sampling(wrong, size), rel=0.1)
+        assert evidence.weigh(item) > 0.0
+    assert [other.worth for other in others] == pytest.approx([evidence.weigh(place) for place in places])
 
 
 @pytest.mark.slow
@@ -160,9 +160,9 @@ def test_similar_places_point_where_the_image_may(broken):
     """Those that a hint on the heading rules out would crowd out the others, and be compared in vain."""
     truth, _, evidence = broken
     up = pose(truth, evidence.scene.size).rotation_deg
-    told = MatchOptions(camera=CameraOptions(heading_deg=(up, 5.0)))
+    reported = MatchOptions(camera=CameraOptions(heading_deg=(up, 5.0)))
     compare = evidence.compared_with(truth)
-    anywhere, there = (similar_places(truth, evidence, compare, match) for match in (MatchOptions(), told))
+    anywhere, there = (similar_places(truth, evidence, compare, match) for match in (MatchOptions(), reported))
 
     def n_turned(others):
         away = [pose(other.matrix, evidence.scene.size).rotation_deg - up for other in others]
@@ -213,11 +213,11 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
     truth, _, evidence = plain
     monkeypatch.setattr(rivals, "similar_places", None)
     wrong = move_about(Homography(truth)(evidence.scene.center), Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
-    one, estimator = search_of(plain, wrong)
-    asked = Rivals({one: estimator}, Ledger(), NEEDED)
-    standing = asked.standing(one)
+    item, estimator = search_of(plain, wrong)
+    asked = Rivals({item: estimator}, Ledger(), NEEDED)
+    standing = asked.standing(item)
     assert standing is None or standing.log10_lead < NEEDED
-    assert asked([one]) is None
+    assert asked([item]) is None
 
 
 @pytest.mark.slow
@@ -230,32 +230,32 @@ def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
 
 
 def test_nothing_met_has_no_standing(plain):
-    one, estimator = search_of(plain)
-    asked = Rivals({one: estimator}, Ledger(), NEEDED)
-    assert asked.standing(one) is None
-    assert asked([one]) is None
+    item, estimator = search_of(plain)
+    asked = Rivals({item: estimator}, Ledger(), NEEDED)
+    assert asked.standing(item) is None
+    assert asked([item]) is None
 
 
 @pytest.mark.slow
 def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
-    one, estimator = search_of(broken, broken[0])
+    first, estimator = search_of(broken, broken[0])
     empty, other = search_of(broken)
-    both = {empty: other, one: estimator}
-    standing = Rivals(both, Ledger(n_reference=866), 1.0).standing(one)
+    both = {empty: other, first: estimator}
+    standing = Rivals(both, Ledger(n_reference=866), 1.0).standing(first)
     half = 0.49 * standing.log10_lead
-    assert Rivals(both, Ledger(n_reference=866), half)([empty, one]) is one
-    assert Rivals(both, Ledger(n_reference=15_000 * 10**4), half)([empty, one]) is None
-    assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, one]) is None
+    assert Rivals(both, Ledger(n_reference=866), half)([empty, first]) is first
+    assert Rivals(both, Ledger(n_reference=15_000 * 10**4), half)([empty, first]) is None
+    assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, first]) is None
 
 
 @pytest.mark.slow
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
-    one, estimator = search_of(broken, broken[0])
-    asked = Rivals({one: estimator}, Ledger(n_reference=866), NEEDED)
-    first, spent = asked.standing(one), one.seconds
+    item, estimator = search_of(broken, broken[0])
+    asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
+    first, spent = asked.standing(item), item.seconds
     assert spent > 0.0  # it is part of the search
     monkeypatch.setattr(rivals, "similar_places", None)
-    assert asked.standing(one) is first
+    assert asked.standing(item) is first
 
 
 @pytest.mark.slow
@@ -264,7 +264,7 @@ def test_streets_around_are_looked_at_only_where_the_places_met_and_the_blocks_b
 ):
     """A block beside may be the place, whether or not the best one that was met leads."""
     looked = []
-    monkeypatch.setattr(rivals, "similar_places", lambda *told: looked.append(told[4:]) or [])
+    monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[4:]) or [])
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
     assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), (rivals._AROUND,)]

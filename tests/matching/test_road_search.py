@@ -131,7 +131,7 @@ def test_a_known_heading_leaves_few_turns_to_try_whichever_way_it_points(town, b
     def grown_from(camera):
         roads = RoadSearch(broken, town[1], camera)
         rounds = list(roads.rounds())
-        gap = min(corner_gap(one.matrix, broken) for a_round in rounds for one in a_round.grown)
+        gap = min(corner_gap(place.matrix, broken) for a_round in rounds for place in a_round.grown)
         return sum(a_round.n_tried for a_round in rounds), gap
 
     (n_blind, _), (n_told, gap) = map(grown_from, (CameraOptions(), CameraOptions(heading_deg=(70.0, 5.0))))

@@ -101,7 +101,7 @@ def test_parts_share_the_work():
     toys = [Toy([[(100 * n + k, 1.0)] for k in range(50)]) for n in range(3)]
     parts = together(*toys, options=SearchOptions(work_limit_s=30.0))
     assert [len(toy.scored) for toy in toys] == [10, 10, 10]
-    assert [one.stopped for one in parts] == ["work"] * 3
+    assert [part.stopped for part in parts] == ["work"] * 3
 
 
 def test_impossible_models_lose_to_any_other():
@@ -124,7 +124,7 @@ class InStages(Toy):
 def together(*toys, options=None, proves=None):
     """Search parts together; an answer of one is that of another where their tens agree."""
     parts = [Search(toy) for toy in toys]
-    search_together(parts, options, lambda one, a, other, b: a[0] // 10 == b[0] // 10, proves)
+    search_together(parts, options, lambda first, a, other, b: a[0] // 10 == b[0] // 10, proves)
     return parts
 
 
@@ -132,7 +132,7 @@ def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
     asked = []
 
     def proves(parts):
-        best = max(parts, key=lambda one: one.score)
+        best = max(parts, key=lambda item: item.score)
         asked.append(best.leaders[0][1][0])
         return best if asked[-1] == 21 else None
 
@@ -140,14 +140,14 @@ def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
     parts = together(*toys, proves=proves)
     assert asked == [1, 21]  # once a stage, of all parts
     assert [toy.scored for toy in toys] == [[1, 2], [11, 21]]
-    assert [one.stopped for one in parts] == ["elsewhere", "accepted"]
+    assert [part.stopped for part in parts] == ["elsewhere", "accepted"]
 
 
 def test_what_stands_out_and_is_not_proved_does_not_end_the_search():
     """It may be the place, fitted to a part of the frame only: a better version may come."""
     toy = Toy([[(1, 30.0)], [(2, 31.0)], [(3, 1.0)]])
-    (one,) = together(toy, proves=lambda parts: parts[0] if parts[0].score > 30.0 else None)
-    assert (toy.scored, one.stopped) == ([1, 2], "accepted")
+    (item,) = together(toy, proves=lambda parts: parts[0] if parts[0].score > 30.0 else None)
+    assert (toy.scored, item.stopped) == ([1, 2], "accepted")
 
 
 def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
@@ -155,7 +155,7 @@ def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
     toys[1].plan[2] = [(17, 30.0)]
     parts = together(*toys)
     assert [len(toy.scored) for toy in toys] == [3, 3, 3]
-    assert [one.stopped for one in parts] == ["elsewhere", "accepted", "elsewhere"]
+    assert [part.stopped for part in parts] == ["elsewhere", "accepted", "elsewhere"]
     assert parts[1].best == (17, 30.0)
 
 
@@ -165,7 +165,7 @@ def test_no_part_goes_to_the_next_stage_before_the_others():
     order = []
     for n, toy in enumerate(toys):
         toy.score = lambda model, n=n: order.append(n) or model[1]
-    assert [one.stopped for one in together(*toys)] == ["exhausted", "exhausted"]
+    assert [item.stopped for item in together(*toys)] == ["exhausted", "exhausted"]
     assert order == [0, 1, 0, 1, 0]
 
 
@@ -173,13 +173,13 @@ def test_a_twin_on_another_part_is_found_before_an_answer_is_accepted():
     """What leads to the answer is tried on all parts first, for each has a round in turn."""
     a, b = Toy([[], [(17, 30.0)], []]), Toy([[], [(52, 29.0)], []])
     parts = together(a, b)
-    assert [one.stopped for one in parts] == ["exhausted", "exhausted"]
+    assert [part.stopped for part in parts] == ["exhausted", "exhausted"]
     assert (parts[0].score, parts[1].score) == (30.0, 29.0)
 
 
 def test_the_same_place_on_a_part_that_overlaps_is_no_rival():
     a, b = Toy([[(17, 30.0)], []]), Toy([[(11, 29.0)], []])
-    assert [one.stopped for one in together(a, b)] == ["accepted", "elsewhere"]
+    assert [item.stopped for item in together(a, b)] == ["accepted", "elsewhere"]
 
 
 def test_many_parts_share_one_time_limit():
@@ -187,5 +187,5 @@ def test_many_parts_share_one_time_limit():
     started = time.perf_counter()
     parts = together(*toys, options=SearchOptions(work_limit_s=1e9, time_limit_s=0.05))
     assert time.perf_counter() - started < 2.0
-    assert {one.stopped for one in parts} == {"time"}
+    assert {part.stopped for part in parts} == {"time"}
     assert max(len(toy.scored) for toy in toys) - min(len(toy.scored) for toy in toys) <= 1

@@ -33,8 +33,8 @@ class Part:
         return np.arange(most)
 
     def follow_up(self, proposals, chosen):
-        for one in proposals.placed[chosen]:
-            yield Hypothesis(np.eye(3), float(one), chosen)
+        for item in proposals.placed[chosen]:
+            yield Hypothesis(np.eye(3), float(item), chosen)
 
     def enough(self):
         return False
@@ -66,14 +66,14 @@ def swept(parts, same_place=None):
 
 
 def supports(hypotheses):
-    return [one.support for one in hypotheses]
+    return [hypothesis.support for hypothesis in hypotheses]
 
 
 def test_the_best_of_all_parts_are_verified_each_where_it_grew(monkeypatch):
     monkeypatch.setattr(growing, "MAX_VERIFIED", 3)
     parts = [Part([[5, 3], [2]]), Part([[9, 1], [8]]), Part([[4], []])]
     sweeps, sweep = swept(parts)
-    found = [[supports(one) for one in sweeps.rounds(part, sweep)] for part in parts]
+    found = [[supports(item) for item in sweeps.rounds(part, sweep)] for part in parts]
     assert found == [[[5.0], [2.0]], [[9.0], [8.0]], [[4.0], []]]
 
 
@@ -100,13 +100,13 @@ def test_each_part_takes_what_grew_on_it_in_its_own_time():
     sweeps, sweep = swept(parts)
     first = sweeps.rounds(parts[0], sweep)
     assert [supports(next(first)), supports(next(first))] == [[5.0], [6.0]]
-    assert [supports(one) for one in sweeps.rounds(parts[1], sweep)] == [[7.0], [8.0]]
+    assert [supports(item) for item in sweeps.rounds(parts[1], sweep)] == [[7.0], [8.0]]
 
 
 def test_a_place_on_ground_that_shards_share_is_verified_once(monkeypatch):
     monkeypatch.setattr(growing, "MAX_VERIFIED", 4)
 
-    def same_place(one, a, other, b):
+    def same_place(first, a, other, b):
         return a.support // 10 == b.support // 10
 
     parts = [Part([[31, 19]]), Part([[52, 45, 18]]), Part([[60, 11]])]
@@ -129,7 +129,7 @@ def towns():
 
 def search_all(scene, indexes, options=None):
     ledger, sweeps = Ledger(sum(map(len, indexes))), SharedSweeps(scene, CameraOptions())
-    parts = [Search(TripleEstimator(scene, one, options, ledger=ledger, sweeps=sweeps)) for one in indexes]
+    parts = [Search(TripleEstimator(scene, index, options, ledger=ledger, sweeps=sweeps)) for index in indexes]
     search_together(parts, SearchOptions(time_limit_s=60.0))
     return parts
 
@@ -139,7 +139,7 @@ def test_a_place_is_found_on_any_of_many_towns(towns):
     networks, indexes = towns
     for k, network in enumerate(networks):
         parts = search_all(scene_of(look(network, TRUTH)), indexes)
-        assert [one.stopped for one in parts] == ["accepted" if n == k else "elsewhere" for n in range(4)]
+        assert [part.stopped for part in parts] == ["accepted" if n == k else "elsewhere" for n in range(4)]
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_a_twin_on_another_part_is_met(towns):
         [*indexes, indexes[1]],
         MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=False),
     )
-    assert "accepted" not in [one.stopped for one in parts]
+    assert "accepted" not in [part.stopped for part in parts]
     assert min(parts[1].score, parts[4].score) > 8.0
 
 
@@ -161,5 +161,5 @@ def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     monkeypatch.setattr(growing, "MAX_SCREENED", 50)
     options = MatchOptions(without_roads=(Sweep(TripleOptions(), 1),), roads=False)
     parts = search_all(stranger, indexes, options)
-    assert sum(one.estimator.n_screened for one in parts) <= 3 * 50
-    assert sum(one.n_scored for one in parts) <= 3 * growing.MAX_VERIFIED
+    assert sum(part.estimator.n_screened for part in parts) <= 3 * 50
+    assert sum(part.n_scored for part in parts) <= 3 * growing.MAX_VERIFIED

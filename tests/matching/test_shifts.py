@@ -11,8 +11,8 @@ def test_of_shifts_that_agree_equally_the_nearest_come_first():
     truth, index, among = contest(1.0)
     options = LocalSearchOptions(reach_m=400.0, turn_deg=0.0, cell_m=10.0, road_m=30.0, max_points=100, n_places=6)
     found = search_nearby(truth, among.scene, index, options)
-    away = [np.hypot(one.east_m, one.north_m) for one in found]
-    alike = [length for length, one in zip(away, found, strict=True) if one.share == found[0].share]
+    away = [np.hypot(result.east_m, result.north_m) for result in found]
+    alike = [length for length, result in zip(away, found, strict=True) if result.share == found[0].share]
     assert len(alike) > 3
     assert alike == sorted(alike)
     assert alike[1] < 2.0 * max(BLOCK)

@@ -157,7 +157,7 @@ def test_the_geopackage_holds_other_places_and_how_sure_the_corners_are(tmp_path
     assert (places["rank"], places["log10_odds"]) == ([2, 3], [3.5, 1.5])
     document = json.loads(paths.json.read_text())
     assert document["corner_covariance_m2"] == covariance.tolist()
-    assert [one["log10_odds"] for one in document["alternatives"]] == [3.5, 1.5]
+    assert [first["log10_odds"] for first in document["alternatives"]] == [3.5, 1.5]
 
 
 def test_the_json_is_the_location(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.outputs.names import bare_command, bare_name, bare_names, table_cell, without_folders
 from roadgeo.outputs.registry import ALSO
 
-DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
+DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,10 @@ def test_a_picture_is_drawn_upright(tmp_path: Path, orientation: int) -> None:
 
 def test_a_mask_of_the_stored_pixels_is_told_so(tmp_path: Path) -> None:
     source = save_turned(tmp_path / "photo.png", np.zeros((400, 300, 3), np.uint8), 6)
-    told = r"is 300 x 400 pixels, its mask 400 x 300: .*make the mask of the upright picture.* \(EXIF orientation 6\)"
-    with pytest.raises(MaskError, match=told):
+    reported = (
+        r"is 300 x 400 pixels, its mask 400 x 300: .*make the mask of the upright picture.* \(EXIF orientation 6\)"
+    )
+    with pytest.raises(MaskError, match=reported):
         image_homography(PLACE, MASK_SIZE, source)
 
 

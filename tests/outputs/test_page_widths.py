@@ -66,7 +66,7 @@ def pages(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
     report("refused without a best", replace(refused, alternatives=(), n_intersections=3))
     report("several maps", replace(refused, reference=f"porto, {LONG}"))
     error = {"query": LONG, "status": "error", "reason": f"{LONG}: no such file"}
-    entries = [Entry(one, "a.html") for one in (found.to_dict(), refused.to_dict(), error)]
+    entries = [Entry(item, "a.html") for item in (found.to_dict(), refused.to_dict(), error)]
     drawn["many"] = render_batch(entries, [index])
     drawn["none of many"] = render_batch(entries[2:], [index])
     truths = [replace(truth(k), file=f"{k}{LONG}") for k in range(9)]

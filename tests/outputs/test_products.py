@@ -137,8 +137,8 @@ def test_names_that_opendronemap_does_not_take_are_told(tmp_path: Path, caplog: 
     photo = tmp_path / "My Photo 1.png"
     cv2.imwrite(str(photo), np.zeros((300, 400, 3), np.uint8))
     write_location(located(), road_mask(), output_paths(tmp_path, "a"), OutputOptions(products=("odm",)), photo)
-    told = "{}: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
-    assert [record.getMessage() for record in caplog.records] == [told.format("My Photo 1.png")]
+    reported = "{}: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
+    assert [record.getMessage() for record in caplog.records] == [reported.format("My Photo 1.png")]
     assert "My Photo 1.png" in (tmp_path / "a_gcp_list.txt").read_text()
 
 

@@ -29,8 +29,8 @@ def test_exact_matches_are_met(n):
 def test_it_is_the_least_squares_that_opencv_finds():
     given = matches(25, noise=2.0)
     found = fit(given)
-    source = np.array([(one.column, one.row) for one in given])
-    target = np.array([(one.x, one.y) for one in given])
+    source = np.array([(item.column, item.row) for item in given])
+    target = np.array([(item.x, item.y) for item in given])
     middle = target.mean(axis=0)
     theirs, _ = cv2.findHomography(source, target - middle, 0)
     mapped = cv2.perspectiveTransform(source[None], theirs)[0] + middle
@@ -57,7 +57,7 @@ def test_a_wrong_match_is_told_and_can_be_switched_off_or_dragged_back():
         [],
         matches(3),
         [Match(100.0 * k, 50.0 * k, 100.0 * k, 50.0 * k) for k in range(8)],
-        [Match(one.column, one.row, one.x, one.y, k < 3) for k, one in enumerate(matches(9))],
+        [Match(match.column, match.row, match.x, match.y, k < 3) for k, match in enumerate(matches(9))],
     ],
 )
 def test_too_little_is_no_fit(given):

@@ -40,11 +40,11 @@ def test_lines_are_chosen_by_their_labels_each_once(tmp_path):
     spool = Spool(tmp_path, 250.0)
     for first in range(0, len(lines), 100):
         spool.add(lines[first : first + 100], labels[first : first + 100])
-    found, told = spool.choose(lambda labels: labels[:, 1] == "main")
-    assert told.tolist() == labels[::2].tolist()
+    found, reported = spool.choose(lambda labels: labels[:, 1] == "main")
+    assert reported.tolist() == labels[::2].tolist()
     assert shapely.equals_exact(found, lines[::2], 0.0).all()
-    none, told = spool.choose(lambda labels: labels[:, 1] == "")
-    assert (len(none), told.shape) == (0, (0, 2))
+    none, reported = spool.choose(lambda labels: labels[:, 1] == "")
+    assert (len(none), reported.shape) == (0, (0, 2))
     assert len(Spool(tmp_path / "nothing", 1.0).choose(lambda labels: labels[:, 1] == "")[0]) == 0
 
 
@@ -114,14 +114,14 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path, coarse):
     path = write_manifest(tmp_path, manifest)
     assert read_manifest(path) == manifest
     reference = open_shards(path)
-    assert [one.entry.name for one in reference.parts] == ["coarse", "0_0_1x1"][0 if coarse and coarse.crs else 1 :]
+    assert [part.entry.name for part in reference.parts] == ["coarse", "0_0_1x1"][0 if coarse and coarse.crs else 1 :]
 
 
 def test_a_manifest_of_before_there_were_coarse_maps_is_read(tmp_path):
-    told = MANIFEST.to_dict()
-    del told["coarse"]
+    document = MANIFEST.to_dict()
+    del document["coarse"]
     path = tmp_path / "manifest.json"
-    path.write_text(json.dumps(told))
+    path.write_text(json.dumps(document))
     assert read_manifest(path) == MANIFEST
     assert manifest_path(tmp_path) == manifest_path(path) == path
     assert manifest_path(tmp_path / "none") is None

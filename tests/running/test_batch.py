@@ -42,10 +42,10 @@ def test_folders_within_folders_are_taken_where_asked_for_and_told_of_else(
     assert find_masks(["flat"]) == [str(Path("flat", "d.png"))]
     assert not caplog.records
     assert find_masks(["DCIM"]) == []
-    told = "DCIM: images in folders within it, such as {}, are passed over; --recursive takes them too"
-    assert [one.getMessage() for one in caplog.records] == [told.format(Path("100", "b.jpg"))]
+    reported = "DCIM: images in folders within it, such as {}, are passed over; --recursive takes them too"
+    assert [record.getMessage() for record in caplog.records] == [reported.format(Path("100", "b.jpg"))]
     assert find_masks(["DCIM"], recursive=True) == [
-        str(Path("DCIM", *one)) for one in (("100", "b.jpg"), ("101", "a.png"))
+        str(Path("DCIM", *item)) for item in (("100", "b.jpg"), ("101", "a.png"))
     ]
 
 
@@ -70,7 +70,7 @@ def test_formats_that_are_read_by_name_are_taken_from_folders_and_others_are_men
         (tmp_path / name).touch()
     assert find_masks([str(tmp_path)]) == [str(tmp_path / name) for name in ("a.gif", "b.ppm", "c.JFIF")]
     passed = "passed over: 2 .heic, 1 .dng: formats that are not read; convert them"
-    assert [one.getMessage() for one in caplog.records] == [f"{tmp_path}: {passed}"]
+    assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {passed}"]
 
 
 def test_results_never_share_a_name() -> None:

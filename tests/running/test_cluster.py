@@ -39,7 +39,7 @@ def scheduler(tmp_path_factory):
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         "DASK_DISTRIBUTED__ADMIN__LOW_LEVEL_LOG_LENGTH": "0",
     }
-    told, processes = folder / "scheduler.json", []
+    reported, processes = folder / "scheduler.json", []
 
     def start(*arguments):
         with (folder / "log").open("ab") as log:
@@ -53,15 +53,15 @@ def scheduler(tmp_path_factory):
             )
         processes.append(process)
 
-    start("distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(told))
+    start("distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(reported))
     workers = ("--nthreads", "1", "--nworkers", "2", "--no-dashboard", "--memory-limit", "0")
-    start("distributed.cli.dask_worker", "--scheduler-file", str(told), *workers)
+    start("distributed.cli.dask_worker", "--scheduler-file", str(reported), *workers)
     try:
         deadline = time.monotonic() + 60
-        while not told.exists() or not told.read_text():
+        while not reported.exists() or not reported.read_text():
             assert time.monotonic() < deadline, (folder / "log").read_text()
             time.sleep(0.1)
-        yield json.loads(told.read_text())["address"]
+        yield json.loads(reported.read_text())["address"]
     finally:
         for process in reversed(processes):
             process.terminate()
@@ -104,7 +104,7 @@ def test_no_more_is_under_way_than_keeps_the_workers_busy(scheduler, tmp_path):
 def test_killed_workers_lose_nothing_and_what_kills_them_all_is_given_up(scheduler, tmp_path):
     work = Squares(str(tmp_path), once=(3,), always=17)
     found = list(Cluster(scheduler).run(range(20), work))
-    assert [one for n, one in enumerate(found) if n != 17] == [n * n for n in range(20) if n != 17]
+    assert [result for n, result in enumerate(found) if n != 17] == [n * n for n in range(20) if n != 17]
     assert found[17].startswith("17: the workers that it was given to died")
     assert len(found) == 20
 
@@ -125,9 +125,9 @@ def test_shards_and_masks_come_out_as_from_one_process(scheduler, tmp_path, monk
     for where in ([], ["--scheduler", scheduler]):
         main(["locate", *masks, "-r", "here.shards", "--json", "-q", "-o", "out", "--effort", "quick", *where])
         found.append([json.loads(line) for line in capsys.readouterr().out.splitlines()])
-    assert [one["status"] for one in found[0]] == ["located", "not_located"]
-    for one, other in zip(*found, strict=True):
-        assert {key: value for key, value in one.items() if key != "seconds"} == {
+    assert [result["status"] for result in found[0]] == ["located", "not_located"]
+    for item, other in zip(*found, strict=True):
+        assert {key: value for key, value in item.items() if key != "seconds"} == {
             key: value for key, value in other.items() if key != "seconds"
         }
 

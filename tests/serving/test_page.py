@@ -104,7 +104,7 @@ def opened(chromium, server, *, width=1280, height=800, phone=False):
     context = chromium.new_context(viewport=viewport, has_touch=phone, is_mobile=phone, reduced_motion="reduce")
     page, said, asked = context.new_page(), [], []
     context.set_default_timeout(PATIENCE_MS)
-    page.on("console", lambda told: said.append(told.text) if told.type == "error" else None)
+    page.on("console", lambda reported: said.append(reported.text) if reported.type == "error" else None)
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("dialog", lambda dialog: (said.append(dialog.message), dialog.dismiss()))
     page.on("request", lambda request: asked.append(request.url))
@@ -198,8 +198,8 @@ def test_what_is_dropped_is_located_and_shown(page, served):
     assert page.locator("progress").get_attribute("value") == "50"
     workers.goes_on.set()
     wait_for(page, "Located")
-    told = [float(number) for number in page.locator("#facts button").inner_text().split(",")]
-    assert told == pytest.approx([lonlat[1], lonlat[0]], abs=1e-4)
+    output = [float(number) for number in page.locator("#facts button").inner_text().split(",")]
+    assert output == pytest.approx([lonlat[1], lonlat[0]], abs=1e-4)
     expect(page.locator("#said")).to_contain_text("mask.png: Located.")
     # On the map: the picture, its outline, the roads.
     shown = """import('./page/map.mjs').then(async (module) => {

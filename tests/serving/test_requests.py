@@ -62,7 +62,8 @@ def test_a_flag_is_no_number():
 
 HINTS = st.sampled_from(["near", "gsd", "maxTilt", "focal", "northUp", "timeLimit", "colour"])
 VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5), lambda one: st.lists(one, max_size=4)
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda item: st.lists(item, max_size=4),
 )
 
 

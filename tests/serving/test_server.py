@@ -384,8 +384,8 @@ def test_it_listens_on_loopback_only():
 def test_a_body_is_never_read_as_the_next_request(method, path, coding):
     hidden = b"GET /health HTTP/1.1\r\nHost: localhost\r\nX-Hidden: yes\r\n\r\n"
     framed = b"%x\r\n%b\r\n0\r\n\r\n" % (len(hidden), hidden)
-    told = b"Transfer-Encoding: chunked" if coding == "chunked" else b"Content-Length: %d" % len(hidden)
-    head = b"%b %b HTTP/1.1\r\nHost: localhost\r\n%b\r\n\r\n" % (method, path, told)
+    reported = b"Transfer-Encoding: chunked" if coding == "chunked" else b"Content-Length: %d" % len(hidden)
+    head = b"%b %b HTTP/1.1\r\nHost: localhost\r\n%b\r\n\r\n" % (method, path, reported)
     with serving() as server:
         answer = send_raw(server, head + (framed if coding == "chunked" else hidden), 0.7)
     assert answer.count(b"HTTP/1.1 ") == 1
@@ -486,8 +486,8 @@ def test_who_prefers_not_to_wait_gets_a_job():
         answer, job = ask(server, "POST", "/locate?gsd=1,2", PNG, LATER)
         assert answer.status == 201
         assert urljoin("/at/locate", answer.headers["Location"]) == f"/at/jobs/{job['jobID']}"
-        told = wait_for(server, job["jobID"], "running")
-        assert (told["message"], told["progress"]) == ("finding roads", 50)
+        reported = wait_for(server, job["jobID"], "running")
+        assert (reported["message"], reported["progress"]) == ("finding roads", 50)
         assert ask(server, "GET", f"/jobs/{job['jobID']}/results")[0].status == 404
         workers.busy.set()
         assert wait_for(server, job["jobID"], "successful")["progress"] == 100
@@ -504,13 +504,13 @@ def test_progress_is_told_as_it_is_made():
         connection.request("GET", f"/jobs/{job}/events")
         answer = connection.getresponse()
         assert answer.headers["Content-Type"].startswith("text/event-stream")
-        states, told = [], answer.readline()
-        while told:
-            if told.startswith(b"data: "):
-                states.append(json.loads(told[6:])["status"])
+        states, output = [], answer.readline()
+        while output:
+            if output.startswith(b"data: "):
+                states.append(json.loads(output[6:])["status"])
                 if states[-1] == "running":
                     workers.busy.set()
-            told = answer.readline()
+            output = answer.readline()
         connection.close()
     assert states[-1] == "successful"
     assert "running" in states
@@ -677,7 +677,7 @@ def test_only_files_that_are_offered_may_be_had():
     with serving(workers) as server:
         job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
         wait_for(server, job, "successful")
-        offered = [one["name"] for one in ask(server, "GET", f"/jobs/{job}/files")[1]["files"]]
+        offered = [item["name"] for item in ask(server, "GET", f"/jobs/{job}/files")[1]["files"]]
         assert {"json", "footprint", "report"} <= set(offered)
         assert "vrt" not in offered
         for name in ("nonesuch", "vrt", "..%2f..%2fetc%2fpasswd", "kept.pickle.gz", "image.png"):

@@ -84,8 +84,8 @@ def test_near_by_streets_have_names(town, tmp_path):
 def test_where_nothing_is_there_is_nothing(tiles):
     made, _ = tiles
     assert made.tile(0, 12, 0, 0) == b""
-    (told,) = made.describe()
-    west, south, east, north = told["bounds"]
+    (reported,) = made.describe()
+    west, south, east, north = reported["bounds"]
     assert west < east
     assert south < north
 

@@ -189,7 +189,7 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
         workers._all[0]._process.kill()
-    assert [one.status for one in answers] == [200]
+    assert [answer.status for answer in answers] == [200]
 
 
 def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
@@ -208,7 +208,7 @@ def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
     monkeypatch.setattr("roadgeo.serving.workers._GRACE_S", 0.3)
     with asked_beside(workers, replace(asked, time_limit_s=0.2)) as answers:
         pass
-    assert [one.status for one in answers] == [503]
+    assert [answer.status for answer in answers] == [503]
     assert "longer than 0.5 s" in answers[0].document["detail"]
     monkeypatch.undo()
     assert workers.ask(asked).status == 200
@@ -231,7 +231,7 @@ def test_who_asks_while_the_server_ends_is_told(one_worker):
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
         workers.close()
-    assert [one.status for one in answers] == [503]
+    assert [answer.status for answer in answers] == [503]
     assert not workers._all[0]._process.is_alive()
 
 

@@ -60,7 +60,7 @@ def test_graphs_of_every_library_give_the_same_roads(name):
     right = choose_roads(table)
     found = choose_roads(GRAPHS[name](), crs=CRS)
     assert found.plane.crs == right.plane.crs
-    lengths = [np.sort(shapely.length(one.lines)) for one in (found, right)]
+    lengths = [np.sort(shapely.length(item.lines)) for item in (found, right)]
     np.testing.assert_allclose(*lengths, atol=0.01)
     assert sorted(found.kinds) == sorted(right.kinds)
 

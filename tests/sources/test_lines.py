@@ -196,13 +196,13 @@ def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch,
     file = write_streets(tmp_path / "a.osm.pbf")
     whole = read_lines(file)
     monkeypatch.setattr("roadgeo.storage.pbf._PART", part_size)
-    told = []
-    read = read_lines(file, advance=told.append)
+    values = []
+    read = read_lines(file, advance=values.append)
     assert shapely.equals(read.lines, whole.lines).all()
     assert read.highway.tolist() == whole.highway.tolist()
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-    assert len(told) == 2 if part_size > file.stat().st_size else len(told) > 2  # nodes, then ways
+    assert values == sorted(values)
+    assert values[-1] == 1.0
+    assert len(values) == 2 if part_size > file.stat().st_size else len(values) > 2  # nodes, then ways
 
 
 @pytest.mark.parametrize("at", [300, -500, -1])

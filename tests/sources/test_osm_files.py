@@ -50,7 +50,9 @@ def test_files_of_every_shape_give_the_same_streets(tmp_path: Path, what: str, e
     assert read(path) == right()
 
 
-@pytest.mark.parametrize("what", [one for one in osm_texts() if one not in ("deleted in JOSM", "places without ids")])
+@pytest.mark.parametrize(
+    "what", [osm_text for osm_text in osm_texts() if osm_text not in ("deleted in JOSM", "places without ids")]
+)
 def test_pbf_files_of_every_shape(tmp_path: Path, what: str) -> None:
     import osmium
 

@@ -129,8 +129,8 @@ def test_what_tells_the_kind(columns, kinds):
 def test_values_of_any_type_are_no_fault(value):
     made = RoadTable(column(shapely.LineString([(0, 0), (1, 1)])), None)
     for name in ("highway", "class", "importance", "road_flags", "names", "other_tags", "position_p", "odd"):
-        one = RoadTable(made.shapes, None, {name: column(value)})
-        assert len(recognise(one).adapt(one).lines) == 1
+        item = RoadTable(made.shapes, None, {name: column(value)})
+        assert len(recognise(item).adapt(item).lines) == 1
 
 
 def test_names_of_all_schemas():

@@ -142,9 +142,9 @@ def test_one_crs_in_many_words(given: object, expected: str) -> None:
 
 @pytest.mark.parametrize("given", ["ESRI:102003", "+proj=laea +lat_0=41 +lon_0=-8", "EPSG:7415"])
 def test_what_has_no_code_is_wkt_that_gdal_reads_too(given: str) -> None:
-    told = name_crs(given)
-    assert rasterio.CRS.from_user_input(told).to_wkt()
-    assert pyproj.CRS(told).equals(pyproj.CRS(given).to_2d(), ignore_axis_order=True)
+    reported = name_crs(given)
+    assert rasterio.CRS.from_user_input(reported).to_wkt()
+    assert pyproj.CRS(reported).equals(pyproj.CRS(given).to_2d(), ignore_axis_order=True)
 
 
 @pytest.mark.parametrize(

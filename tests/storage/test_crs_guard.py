@@ -26,9 +26,9 @@ def write(path: Path) -> None:
 def geojson(folder: Path, crs: str, key: str = '"crs"') -> Path:
     line = {"type": "LineString", "coordinates": [[5e5, 4.5e6], [501000, 4501000]]}
     feature = {"type": "Feature", "properties": {}, "geometry": line}
-    told = json.dumps({"crs": {"type": "name", "properties": {"name": crs}}, "features": [feature]})
+    reported = json.dumps({"crs": {"type": "name", "properties": {"name": crs}}, "features": [feature]})
     path = folder / "roads.geojson"
-    path.write_text('{"type": "FeatureCollection", ' + told[1:].replace('"crs"', key))
+    path.write_text('{"type": "FeatureCollection", ' + reported[1:].replace('"crs"', key))
     return path
 
 
@@ -63,8 +63,8 @@ def flatgeobuf(folder: Path, crs: str) -> Path:
     geopandas.GeoDataFrame(geometry=LINES, crs="+proj=tmerc +lon_0=-9.5 +ellps=GRS80").to_file(folder / "roads.fgb")
     content = (folder / "roads.fgb").read_bytes()
     at = content.index(b'PROJCRS["unknown"')
-    told = crs.encode()[-800:]  # as long as what stands there
-    (folder / "roads.fgb").write_bytes(content[:at] + told + content[at + len(told) :])
+    reported = crs.encode()[-800:]  # as long as what stands there
+    (folder / "roads.fgb").write_bytes(content[:at] + reported + content[at + len(reported) :])
     return folder / "roads.fgb"
 
 

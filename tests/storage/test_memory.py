@@ -31,9 +31,9 @@ print(resident_mb() - before)
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_freed_geometries_leave_hardly_anything() -> None:
-    told = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True).stdout
-    assert float(told) < 50.0  # of 98
-    assert float(told) > -5.0
+    output = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True).stdout
+    assert float(output) < 50.0  # of 98
+    assert float(output) > -5.0
 
 
 def resident_mb() -> float:

@@ -38,7 +38,7 @@ def test_any_header_is_taken_or_refused(header: bytes) -> None:
 
 def blob(*texts: bytes, packed: bool = False, table: int = 1) -> bytes:
     """A blob of a block whose table holds these texts."""
-    block = text(table, b"".join(text(1, one) for one in texts)) + text(2, b"\0\0\0")
+    block = text(table, b"".join(text(1, item) for item in texts)) + text(2, b"\0\0\0")
     return text(3, zlib.compress(block)) if packed else text(1, block)
 
 
@@ -73,6 +73,6 @@ def test_a_blob_that_cannot_be_looked_at_is_refused(content: bytes) -> None:
 
 @given(st.binary(max_size=60))
 def test_any_blob_is_taken_or_refused(content: bytes) -> None:
-    for one in (content, text(1, content), text(3, zlib.compress(content))):
+    for item in (content, text(1, content), text(3, zlib.compress(content))):
         with suppress(*REFUSED):
-            _require_text(one)
+            _require_text(item)

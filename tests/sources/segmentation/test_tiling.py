@@ -280,7 +280,7 @@ def test_a_model_of_another_threshold_counts_from_there() -> None:
 def test_maps_are_fused_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a large photograph the numbers with a point would take gigabytes."""
     values = np.random.default_rng(1).integers(0, 256, (2, 70, 40)).astype(np.uint8)
-    whole, maps = [], [ProbabilityMap(one, 0.3) for one in values]
+    whole, maps = [], [ProbabilityMap(value, 0.3) for value in values]
     for pixels in (1 << 20, 1000):
         monkeypatch.setattr(probability, "_STRIP_PIXELS", pixels)
         whole.append(fuse(maps))
@@ -304,5 +304,5 @@ def test_more_ways_average_what_is_seen(network, photo: Path) -> None:
     assert np.ptp(four) < 1e-6
     assert np.isfinite(_look(lambda tile: np.ones(tile.shape[:2], np.float32), 4, tile)).all()
     with open_photograph(photo) as opened:  # a model of single pixels sees the same each way
-        one, many = segment(opened, network), segment(opened, network, ways=4)
-    np.testing.assert_array_equal(one.mask(0.5).roads, many.mask(0.5).roads)
+        item, many = segment(opened, network), segment(opened, network, ways=4)
+    np.testing.assert_array_equal(item.mask(0.5).roads, many.mask(0.5).roads)
