@@ -107,9 +107,11 @@ def choose_roads(
         given = None if crs is None else name_crs(crs)
         return read_roads(listed, crs=given, which=which, tunnels=tunnels, attribution=attribution, say=say)
     table = held_table(roads)
-    chosen = choose_lines(with_crs(recognise(table).adapt(table), crs, name), name, which, tunnels)
-    tell_source(name, chosen.meta)
-    return join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
+    lines = recognise(table).adapt(table)
+    lines = with_crs(lines, crs, name)
+    lines = choose_lines(lines, name, which, tunnels)
+    tell_source(name, lines.meta)
+    return join_roads([lines], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
 def read_roads(
