@@ -19,7 +19,8 @@ from roadgeo.kernels.triples import look_up_each
 from roadgeo.matching.index import ReferenceIndex, build_index
 from roadgeo.matching.scene import MIN_COS, Scene, trace_query
 from roadgeo.matching.triples import TripleOptions, propose
-from roadgeo.reference.reference import Reference, build_network
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.network import build_network
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import read_roads
 

@@ -19,9 +19,9 @@ from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, open_whole
 from roadgeo.roads.kinds import RoadKind
-from roadgeo.roads.labels import label_roads
+from roadgeo.roads.network import build_network
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -67,13 +67,12 @@ def build_reference(
     OutputError
         It cannot be written.
     """
-    from roadgeo.reference.network_file import as_stored
     from roadgeo.sources.roads import choose_roads
 
     chosen = choose_roads(roads, kinds, tunnels, attribution, say)
     options = options or BuildOptions()
-    network = build_network(chosen.lines, chosen.plane, {"name": name, **chosen.meta}, options, say)
-    network = as_stored(label_roads(network, chosen.lines, chosen.names, chosen.kinds))
+    meta = {"name": name, **chosen.meta}
+    network = build_network(chosen.lines, chosen.plane, meta, options, say, names=chosen.names, kinds=chosen.kinds)
     reference = Reference(build_index(network, options.index, say), network)
     if path is None:
         return reference

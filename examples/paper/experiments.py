@@ -24,11 +24,11 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.library import resolve_reference
-from roadgeo.reference.network_file import as_stored, read_network
+from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections, find_intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, as_stored
 from roadgeo.workflows import LocateOptions, locate
 
 #: Section 4.3: "an area of 10 x 10 km2"; section 4.4: cross-ratio error 0.3, inlier ratio 0.5, 30 intersections.

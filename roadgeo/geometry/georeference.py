@@ -11,7 +11,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
+from roadgeo.geometry.projection import LocalPlane, to_lonlat, to_plane, transform
 from roadgeo.storage.orientation import stored_from_upright
 
 __all__ = ["Georeference", "fit_place"]
@@ -52,7 +52,7 @@ class Georeference:
             It lies outside what the plane's CRS, or its own, is made for.
         """
         pixels, there = self.control_points()
-        xy = plane.from_crs(np.stack(transformer(self.crs, plane.crs).transform(*there.T), axis=1))
+        xy = to_plane(self.crs, plane, there)
         if not np.isfinite(xy).all():
             raise CrsError(f"its corners lie outside what {self.crs[:40]} or {plane.crs[:40]} is made for")
         return fit_place(pixels, xy, projective=True)
@@ -69,7 +69,7 @@ class Georeference:
         """
         pixels, _ = self.control_points()
         there = plane.to_crs(Homography(on_plane).facing(Frame(*self.size).center)(pixels))
-        xy = np.stack(transformer(plane.crs, self.crs).transform(*there.T), axis=1)
+        xy = transform(plane.crs, self.crs, there)
         matrix = fit_place(pixels, xy, projective=self.source == "control points")
         return Georeference(matrix, self.crs, self.size, self.source)
 

@@ -29,6 +29,8 @@ __all__ = [
     "metres_apart",
     "serves_as_plane",
     "to_lonlat",
+    "to_plane",
+    "transform",
     "transformer",
 ]
 
@@ -137,7 +139,7 @@ def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
     steps = []
     for azimuth in (0.0, 90.0):
         ahead = Geod(ellps="WGS84").fwd(lon, lat, np.full(len(lon), azimuth), np.full(len(lon), 100.0))[:2]
-        ends = [np.stack(transformer("EPSG:4326", crs).transform(*points), axis=1) for points in ((lon, lat), ahead)]
+        ends = [transform("EPSG:4326", crs, np.stack(points, axis=1)) for points in ((lon, lat), ahead)]
         steps.append((ends[1] - ends[0]) / 100.0)
     scales = np.hypot(*np.moveaxis(np.stack(steps), -1, 0))
     skew = np.sum(steps[0] * steps[1], axis=1) / scales.prod(axis=0)
@@ -162,15 +164,22 @@ def _conformal_crs(points: FloatArray) -> str:
 
 def to_lonlat(crs: str, en: FloatArray) -> FloatArray:
     """Take (N, 2) coordinates of a CRS to longitude and latitude (WGS 84), degrees."""
-    points = np.asarray(en, float)
-    return np.stack(transformer(crs, "EPSG:4326").transform(points[:, 0], points[:, 1]), axis=1)
+    return transform(crs, "EPSG:4326", en)
 
 
 def from_lonlat(plane: LocalPlane, lonlat: FloatArray) -> FloatArray:
     """Take (N, 2) longitudes and latitudes (WGS 84), degrees, to plane metres."""
-    points = np.asarray(lonlat, float)
-    en = transformer("EPSG:4326", plane.crs).transform(points[:, 0], points[:, 1])
-    return plane.from_crs(np.stack(en, axis=1))
+    return to_plane("EPSG:4326", plane, lonlat)
+
+
+def to_plane(crs: str, plane: LocalPlane, xy: FloatArray) -> FloatArray:
+    """Take (N, 2) coordinates of a CRS to plane metres."""
+    return plane.from_crs(transform(crs, plane.crs, xy))
+
+
+def transform(source: str, target: str, xy: FloatArray) -> FloatArray:
+    """Take (N, 2) coordinates of a CRS to another, which is no number where that has no such place."""
+    return np.stack(transformer(source, target).transform(*np.asarray(xy, float).T), axis=1)
 
 
 def metres_apart(a: FloatArray, b: FloatArray) -> float:

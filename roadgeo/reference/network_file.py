@@ -34,7 +34,6 @@ from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_l
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, name_features, seen_from, widen_by
 
 __all__ = [
-    "as_stored",
     "computed_digest",
     "dump_network",
     "network_digest",
@@ -111,23 +110,6 @@ INSERT INTO gpkg_extensions VALUES
     ('gpkg_metadata_reference', NULL, 'gpkg_metadata', 'http://www.geopackage.org/spec121/#extension_metadata',
      'read-write');
 """
-
-
-def as_stored(network: RoadNetwork) -> RoadNetwork:
-    """Round positions to the resolution of the GeoPackage, at most some nanometres away.
-
-    An index built from the result is identical to one built from the file later.
-    """
-    plane = network.plane
-
-    def rounded(xy: FloatArray) -> FloatArray:
-        return plane.from_crs(plane.to_crs(xy))
-
-    graph = replace(network.graph, xy=rounded(network.graph.xy), coords=rounded(network.graph.coords))
-    intersections = replace(network.intersections, xy=rounded(network.intersections.xy))
-    return replace(
-        network, graph=graph, intersections=intersections, coverage=tuple(rounded(ring) for ring in network.coverage)
-    )
 
 
 def write_network(path: str | os.PathLike[str], network: RoadNetwork) -> None:

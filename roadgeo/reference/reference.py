@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, RoadSourceError
-from roadgeo.geometry.projection import LocalPlane
 from roadgeo.kernels.triple_codes import MAX_NEIGHBOURS
 from roadgeo.location import Location
 from roadgeo.matching.index import COARSENESS, IndexOptions, ReferenceIndex, build_index
 from roadgeo.matching.parts import Part, Whole
-from roadgeo.roads.intersections import IntersectionOptions, find_intersections
-from roadgeo.roads.network import RoadNetwork
-from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
-from roadgeo.storage.memory import give_back_memory, let_pages_go
+from roadgeo.roads.intersections import IntersectionOptions
+from roadgeo.roads.network import NetworkOptions, RoadNetwork
+from roadgeo.roads.simplification import SimplifyOptions
+from roadgeo.storage.memory import let_pages_go
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -30,7 +29,6 @@ __all__ = [
     "AnyReference",
     "BuildOptions",
     "Reference",
-    "build_network",
     "open_reference",
     "open_whole",
     "rebuild_reference",
@@ -40,11 +38,9 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class BuildOptions:
+class BuildOptions(NetworkOptions):
     """Options of all stages of building a reference; lengths in metres."""
 
-    simplify: SimplifyOptions = field(default_factory=SimplifyOptions)
-    intersections: IntersectionOptions = field(default_factory=IntersectionOptions)
     index: IndexOptions = field(default_factory=IndexOptions)
 
 
@@ -124,30 +120,6 @@ def swapped_near(
 
 def _touches(near: tuple[float, float, float], references: Sequence[AnyReference]) -> bool:
     return any(part.may_hold(near) for one in references for part in one.parts)
-
-
-def build_network(
-    lines: Sequence[Any] | AnyArray,
-    plane: LocalPlane,
-    meta: dict[str, Any],
-    options: BuildOptions | None = None,
-    say: Say = say_nothing,
-) -> RoadNetwork:
-    """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections.
-
-    The network's `meta` is the one given and the options, for whoever builds its index again.
-    """
-    from roadgeo.roads.simplification import coverage
-
-    options = options or BuildOptions()
-    say(f"cutting {len(lines):,} lines where they cross")
-    graph = planarize(lines)
-    give_back_memory()
-    drawing = "drawing them as a mask shows them"
-    graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
-    give_back_memory()
-    found = find_intersections(graph, options.intersections)
-    return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
 
 
 def stored_options(network: RoadNetwork) -> BuildOptions:

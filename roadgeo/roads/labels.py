@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.roads.network import RoadNetwork
 
 __all__ = ["label_roads"]
 
@@ -16,8 +13,10 @@ __all__ = ["label_roads"]
 _REACH_M = 30.0
 
 
-def label_roads(network: RoadNetwork, lines: AnyArray, names: AnyArray | None, kinds: AnyArray | None) -> RoadNetwork:
-    """Give each road the name and the kind of the line that is nearest to its middle.
+def label_roads(
+    graph: RoadGraph, lines: AnyArray, names: AnyArray | None, kinds: AnyArray | None
+) -> tuple[AnyArray | None, AnyArray | None]:
+    """Return the name and the kind of each road, (E,): as of the line that is nearest to its middle.
 
     Parameters
     ----------
@@ -27,13 +26,13 @@ def label_roads(network: RoadNetwork, lines: AnyArray, names: AnyArray | None, k
         Text of each line; None where no line has any.
     """
     if names is None and kinds is None:
-        return network
-    nearest = _nearest(network.graph, lines)
+        return None, None
+    nearest = _nearest(graph, lines)
     named, classed = (
         np.append(np.full(len(lines), "", object) if column is None else column, "")[nearest]
         for column in (names, kinds)
     )
-    return replace(network, names=named, kinds=classed)
+    return named, classed
 
 
 def _nearest(graph: RoadGraph, lines: AnyArray) -> AnyArray:

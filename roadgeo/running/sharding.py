@@ -22,10 +22,10 @@ import numpy as np
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError, RoadSourceError
-from roadgeo.geometry.projection import transformer
+from roadgeo.geometry.projection import transform
 from roadgeo.matching.index import build_index
 from roadgeo.reference.index_file import FORMAT_VERSION
-from roadgeo.reference.reference import COARSE, BuildOptions, Reference, build_network
+from roadgeo.reference.reference import COARSE, BuildOptions, Reference
 from roadgeo.reference.shard_plan import ShardBox, bounds_in_degrees, plan_shards, widen
 from roadgeo.reference.shards import (
     Manifest,
@@ -37,7 +37,7 @@ from roadgeo.reference.shards import (
 )
 from roadgeo.reference.spool import Bounds, Spool
 from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
-from roadgeo.roads.labels import label_roads
+from roadgeo.roads.network import build_network
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines
 from roadgeo.sources.overpass import box_area
@@ -256,8 +256,7 @@ def _to(lines: RoadLines, crs: str) -> Any:
 
     if lines.crs == crs:
         return lines.lines
-    way = transformer(str(lines.crs), crs)
-    return shapely.transform(lines.lines, lambda xy: np.stack(way.transform(*xy.T), axis=1))
+    return shapely.transform(lines.lines, lambda xy: transform(str(lines.crs), crs, xy))
 
 
 def _labels(lines: RoadLines) -> Any:
@@ -353,23 +352,21 @@ class ShardWork:
     def _build_reference(self, entry: ShardEntry, lines: RoadLines, box: ShardBox) -> ShardEntry:
         """Build and write the reference of a shard; three intersections are needed."""
         from roadgeo.reference.files import reference_digest, reference_paths
-        from roadgeo.reference.network_file import as_stored
 
         joined = join_roads([lines], {}, None)
         meta, options = {**self.meta, "plane": joined.meta["plane"], "shard": box.name}, self.options.build
         if box.name == _COARSE:
             del meta["shard_of"]  # a place on it lies not quite where it lies on a shard
             options = replace(options, simplify=COARSE.simplify)
-        network = build_network(joined.lines, joined.plane, meta, options)
-        network = as_stored(label_roads(network, joined.lines, joined.names, joined.kinds))
+        network = build_network(joined.lines, joined.plane, meta, options, names=joined.names, kinds=joined.kinds)
         if len(network.intersections) < 3:
             return entry
         index = build_index(network, self.options.build.index)
         path = Path(self.folder) / f"{box.name}.gpkg"
         Reference(index, network).save(path)
-        there = transformer(joined.plane.crs, str(lines.crs)).transform(*joined.plane.to_crs(index.xy).T)
+        there = transform(joined.plane.crs, str(lines.crs), joined.plane.to_crs(index.xy))
         x0, y0, x1, y1 = box.core
-        own = (there[0] >= x0) & (there[0] < x1) & (there[1] >= y0) & (there[1] < y1)
+        own = ((there >= (x0, y0)) & (there < (x1, y1))).all(axis=1)
         files = reference_paths(path)
         return replace(
             entry,

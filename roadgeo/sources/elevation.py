@@ -8,7 +8,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
-from roadgeo.geometry.projection import transformer
+from roadgeo.geometry.projection import transform
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.rasters import open_raster
 
@@ -39,7 +39,7 @@ def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> Flo
         own = crs_name(raster.crs.to_wkt())
         if own is None:
             raise CrsError(f"{os.fspath(dem)}: its CRS does not describe places on Earth; assign the right one")
-        there = np.stack(transformer(crs, own).transform(*np.asarray(xy, float).T), axis=1)
+        there = transform(crs, own, xy)
         inside = np.isfinite(there).all(axis=1)
         values = np.full(len(there), np.nan)
         for i in np.flatnonzero(inside):

@@ -19,7 +19,7 @@ from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import visible
 from roadgeo.errors import CrsError, NoRoadsError, RoadSourceError
-from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, transformer
+from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, to_plane
 from roadgeo.roads.kinds import RoadKind, drives
 from roadgeo.sources.containers import held_table
 from roadgeo.sources.lines import RoadLines, cut_lines
@@ -283,6 +283,8 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
     filled = [source for source in sources if len(source.lines)]
     if not filled:
         raise _no_roads(sources)
+    names = as_text([source.name for source in filled], filled)
+    kinds = as_text([source.highway for source in filled], filled)
     shared = {source.crs for source in filled}
     own_crs = shared.pop() if len(shared) == 1 else None
     plane = choose_plane(np.concatenate([_corners(source) for source in filled]), own_crs)
@@ -296,8 +298,8 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
-        names=as_text([source.name for source in filled], filled),
-        kinds=as_text([source.highway for source in filled], filled),
+        names,
+        kinds,
     )
 
 
@@ -367,9 +369,7 @@ def _to_plane(source: RoadLines, plane: LocalPlane) -> AnyArray:
     """Return a source's lines in plane metres."""
     import shapely
 
-    way = transformer(str(source.crs), plane.crs)
-    moved = shapely.transform(source.lines, lambda xy: plane.from_crs(np.stack(way.transform(*xy.T), axis=1)))
-    return np.asarray(moved)
+    return np.asarray(shapely.transform(source.lines, lambda xy: to_plane(str(source.crs), plane, xy)))
 
 
 def _no_roads(sources: Sequence[RoadLines], hint: str = "") -> RoadSourceError:

@@ -94,6 +94,7 @@ class Schema:
         kinds, others = self._kinds(columns, len(table.shapes))
         shapes = table.shapes[~others]
         lines, place = simple_lines(shapes)
+        areas = simple_areas(shapes)
         row = np.flatnonzero(~others)[place]
         tunnels = [
             in_tunnel(_each(columns[name], _HIDDEN.get(name, _itself))[row]) for name in _TUNNELS if name in columns
@@ -109,7 +110,7 @@ class Schema:
             np.logical_or.reduce(tunnels) if tunnels else None,
             {"features": len(table.shapes)} | {key: value for key, value in told.items() if value},
             None if called is None else _each(called[row], _text),
-            simple_areas(shapes),
+            areas,
         )
 
     def _kinds(self, columns: Mapping[str, AnyArray], n: int) -> tuple[AnyArray, BoolArray]:

@@ -11,9 +11,9 @@ from worlds.towns import lattice_town
 from roadgeo.cli import main
 from roadgeo.evaluation.truth import read_truth
 from roadgeo.outputs.schemas import read_schema
-from roadgeo.reference.network_file import as_stored, write_network
+from roadgeo.reference.network_file import write_network
 from roadgeo.roads.intersections import find_intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, as_stored
 
 SMALL = ["--size", "500", "--gsd", "1:1", "--tilt", "0:20", "--intersections", "10:99"]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from worlds.towns import lattice_town
 
-from roadgeo.reference.network_file import as_stored, write_network
+from roadgeo.reference.network_file import write_network
 from roadgeo.roads.intersections import find_intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, as_stored
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 

@@ -17,7 +17,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.index import build_index
 from roadgeo.reference.reference import Reference
-from roadgeo.workflows import build_network
+from roadgeo.roads.network import build_network
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 

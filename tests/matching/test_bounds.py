@@ -17,7 +17,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching import scene
 from roadgeo.matching.index import build_index
 from roadgeo.matching.search import SearchOptions
-from roadgeo.reference.reference import Reference, build_network
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.network import build_network
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import LocateOptions, locate
 

@@ -23,7 +23,8 @@ from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.explanation_sheet import STARVED, draw_explanation, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
-from roadgeo.reference.reference import Reference, build_network
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.network import build_network
 from roadgeo.workflows import LocateOptions, explain, locate
 
 SIZE = (900, 900)

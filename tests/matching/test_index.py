@@ -24,10 +24,9 @@ from roadgeo.matching.index import (
     pack_tangents,
     sort_by_bucket,
 )
-from roadgeo.reference.reference import build_network
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, build_network
 
 coordinates = st.floats(-1e6, 1e6)
 points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=30).map(lambda p: np.array(p, float))

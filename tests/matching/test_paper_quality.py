@@ -8,7 +8,7 @@ from worlds.scenes import PLANE
 from roadgeo.matching import paper
 from roadgeo.matching.index import build_index
 from roadgeo.matching.paper import well_fitted
-from roadgeo.reference.reference import build_network
+from roadgeo.roads.network import build_network
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,8 @@ from roadgeo.outputs.drawing.views import ViewOptions
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.report import Entry, render_batch, render_report, write_batch
-from roadgeo.reference.reference import Reference, build_network
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.network import build_network
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import locate

@@ -28,8 +28,8 @@ from roadgeo.reference.files import (
 )
 from roadgeo.reference.index_file import FORMAT_VERSION, read_manifest
 from roadgeo.reference.inspection import check_reference, describe_reference
-from roadgeo.reference.network_file import as_stored, network_digest, read_network, write_network
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.reference.network_file import network_digest, read_network, write_network
+from roadgeo.roads.network import RoadNetwork, as_stored
 
 IndexParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -345,7 +345,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, network: RoadNe
         "import resource, sys, numpy as np\n"
         "from worlds.networks import grid_network\n"
         "from roadgeo.errors import OutputError\n"
-        "from roadgeo.reference.network_file import as_stored\n"
+        "from roadgeo.roads.network import as_stored\n"
         "from roadgeo.reference.files import write_reference\n"
         "network = as_stored(grid_network(seed=3))\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)\n"

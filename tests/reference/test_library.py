@@ -18,7 +18,7 @@ from roadgeo.reference.library import (
     remove_reference,
     resolve_reference,
 )
-from roadgeo.reference.network_file import as_stored
+from roadgeo.roads.network import as_stored
 
 
 @pytest.fixture(autouse=True)

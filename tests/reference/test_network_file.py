@@ -17,7 +17,6 @@ from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.reference.inspection import check_reference, describe_reference
 from roadgeo.reference.network_file import (
-    as_stored,
     computed_digest,
     network_digest,
     read_meta,
@@ -27,7 +26,7 @@ from roadgeo.reference.network_file import (
     write_network,
 )
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, as_stored
 from roadgeo.storage.geopackage import layer_names
 
 

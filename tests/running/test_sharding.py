@@ -21,8 +21,9 @@ from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.inspection import check_reference, reference_digest
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import build_network, open_reference
+from roadgeo.reference.reference import open_reference
 from roadgeo.reference.shards import write_manifest
+from roadgeo.roads.network import build_network
 from roadgeo.running import sharding
 from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
 from roadgeo.workflows import build_reference
@@ -252,7 +253,9 @@ def test_a_build_of_before_there_were_coarse_maps_gets_one(region, tmp_path, mon
     (folder / region.manifest.build / "coarse.json").unlink()
     write_manifest(folder, replace(region.manifest, coarse=None))
     built, usual = [], sharding.build_network
-    monkeypatch.setattr(sharding, "build_network", lambda *given: built.append(given[2]["shard"]) or usual(*given))
+    monkeypatch.setattr(
+        sharding, "build_network", lambda *given, **more: built.append(given[2]["shard"]) or usual(*given, **more)
+    )
     source = RoadFiles((region.path.parent / "region.gpkg",))
     again = build_shards(source, folder, "region", ShardOptions(size_m=15_000.0, margin_m=1000.0))
     assert built == ["coarse"]
@@ -270,11 +273,11 @@ def test_a_build_that_was_cut_short_goes_on(roads, tmp_path, monkeypatch):
     folder, built = tmp_path / "town.shards", []
     usual = sharding.build_network
 
-    def dies(lines, plane, meta, *rest):
+    def dies(lines, plane, meta, *rest, **labels):
         built.append(meta["shard"])
         if len(built) == 3:
             raise KeyboardInterrupt
-        return usual(lines, plane, meta, *rest)
+        return usual(lines, plane, meta, *rest, **labels)
 
     monkeypatch.setattr(sharding, "build_network", dies)
     with pytest.raises(KeyboardInterrupt):

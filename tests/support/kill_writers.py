@@ -27,8 +27,8 @@ from worlds.networks import grid_network
 
 from roadgeo.reference.files import open_reference, write_reference
 from roadgeo.reference.inspection import check_reference
-from roadgeo.reference.network_file import as_stored, network_digest, read_network
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.reference.network_file import network_digest, read_network
+from roadgeo.roads.network import RoadNetwork, as_stored
 
 SIZES = (6, 16)
 

@@ -8,7 +8,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import build_index
 from roadgeo.matching.shifts import Shift, move_about
-from roadgeo.workflows import build_network
+from roadgeo.roads.network import build_network
 from worlds.scenes import Sight, camera, look, scene_of
 
 BLOCK = (110, 90)

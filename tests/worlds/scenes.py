@@ -8,10 +8,9 @@ from scipy.spatial import Delaunay
 
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.scene import Scene, prepare_scene
-from roadgeo.reference.reference import build_network
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, build_network
 
 __all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
 
