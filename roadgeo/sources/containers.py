@@ -96,7 +96,7 @@ def _stream_gdal(
             if found.shapes is None:
                 raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
             shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
-            meta = {"format": found.driver, "layer": ", ".join(layers), **found.told}
+            meta = {"format": found.driver, "layer": ", ".join(layers), **found.notes}
             yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(layers))
 

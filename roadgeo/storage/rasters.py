@@ -358,8 +358,8 @@ def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetRe
         reason = " ".join(str(error).split())[:200]
         raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers, by numpy.save") from error
     if array is None or array.dtype.kind not in "biuf":
-        told = "" if array is None else f" of {array.dtype}"
-        raise MaskError(f"{name}: holds an array{told}; expected (rows, columns) of real numbers, bands first or last")
+        what = "" if array is None else f" of {array.dtype}"
+        raise MaskError(f"{name}: holds an array{what}; expected (rows, columns) of real numbers, bands first or last")
     if max(array.shape[1:]) > MAX_SIDE or array.nbytes > _MAX_TURNED_BYTES:
         raise MaskError(f"{name}: an array of {array.shape}, {array.nbytes / 1e9:.1f} GB; save it as GeoTIFF")
     kind = "uint8" if array.dtype.kind == "b" else "float32" if array.dtype == np.float16 else array.dtype.name
@@ -386,8 +386,8 @@ def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: b
     """Return the orientation of a raster; for a remote one GDAL reports it, of JPEGs alone."""
     if not remote:
         return read_orientation(path)
-    told = dataset.tags().get("EXIF_Orientation", "")
-    return int(told) if told in list("12345678") else UPRIGHT
+    stated = dataset.tags().get("EXIF_Orientation", "")
+    return int(stated) if stated in list("12345678") else UPRIGHT
 
 
 @contextmanager

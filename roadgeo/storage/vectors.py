@@ -49,7 +49,7 @@ class VectorLayer(NamedTuple):
     columns : (N,) object each, by name
     crs : str or None
     driver : str
-    told : dict
+    notes : dict
         `encoding`, where text was not in the encoding that the file names.
     """
 
@@ -57,7 +57,7 @@ class VectorLayer(NamedTuple):
     columns: dict[str, AnyArray]
     crs: str | None
     driver: str
-    told: dict[str, str]
+    notes: dict[str, str]
 
 
 def list_layers(path: Path) -> list[tuple[str, str]]:
@@ -79,8 +79,8 @@ def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
     import pyogrio
 
     with _guarded(path, layer) as file:
-        told, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
-        return int(told["features"]), [str(name) for name in told["fields"]]
+        info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
+        return int(info["features"]), [str(name) for name in info["fields"]]
 
 
 def read_layer(
@@ -98,10 +98,10 @@ def read_layer(
         _require_stored(path, layer)
         part = {"skip_features": skip, "max_features": most, "columns": list(columns), "force_2d": True}
         info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, **more))
-        found, told = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
+        found, notes = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
     meta, _, shapes, values = found
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
-    return VectorLayer(shapes, named, meta["crs"], info["driver"], told)
+    return VectorLayer(shapes, named, meta["crs"], info["driver"], notes)
 
 
 def _decoded(read: Callable[..., Any]) -> tuple[Any, dict[str, str]]:
@@ -136,13 +136,13 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
             warnings.simplefilter("ignore")
             yield file
     except (CRSError, UnboundLocalError) as error:  # the latter is pyogrio's
-        told = "it is no text in UTF-8" if isinstance(error, UnboundLocalError) else first_line(error)
-        raise RoadSourceError(f"{path}: names an unknown CRS: {told}") from error
+        reason = "it is no text in UTF-8" if isinstance(error, UnboundLocalError) else first_line(error)
+        raise RoadSourceError(f"{path}: names an unknown CRS: {reason}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
-        told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
-        told = told.replace(str(file), str(path))
-        hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if told.startswith("of") else ""
-        raise RoadSourceError(f"{path}: not readable as a map of roads: {told}{hint}") from error
+        reason = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
+        reason = reason.replace(str(file), str(path))
+        hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if reason.startswith("of") else ""
+        raise RoadSourceError(f"{path}: not readable as a map of roads: {reason}{hint}") from error
 
 
 @contextmanager

@@ -97,24 +97,24 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
     """
     path = Path(model.path)
     try:
-        told = {**_read_metadata(model.metadata), **_read_sidecar(path.with_suffix(".json"))}
-        return _make_card(model, told, class_name)
+        metadata = {**_read_metadata(model.metadata), **_read_sidecar(path.with_suffix(".json"))}
+        return _make_card(model, metadata, class_name)
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise ModelError(f"{path}: its metadata are invalid ({error}); correct them") from error
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
 
-def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -> ModelCard:
-    kind = str(told.get("model_type", "Segmentor"))
+def _make_card(model: OnnxModel, metadata: dict[str, Any], class_name: str | None) -> ModelCard:
+    kind = str(metadata.get("model_type", "Segmentor"))
     if kind.lower() != "segmentor":
         raise ModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
-    tile, channels_last = _tile_of(model, told)
-    names = told.get("classes", {})
+    tile, channels_last = _tile_of(model, metadata)
+    names = metadata.get("classes", {})
     output = _choose_output(model, class_name)
     gives_classes = output.kind in _WHOLE and _n_channels(output) in (None, 1)
     channels = _choose(output, gives_classes, names, class_name)
-    resolution = told.get("resolution_m")
+    resolution = metadata.get("resolution_m")
     if resolution is not None and not 0.01 <= resolution <= 100:
         raise ValueError(f"a resolution of {resolution:g} m per pixel")
     card = ModelCard(
@@ -122,11 +122,11 @@ def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -
         tile=tile,
         kind=model.inputs[0].kind,
         channels_last=channels_last,
-        overlap=_within(told.get("overlap", 0.125), 0.0, 0.75, "overlap"),
-        mean=_triple(told.get("mean", 0.0), "mean"),
-        std=_triple(told.get("std", 1.0), "standard deviation"),
-        threshold=_within(told.get("threshold", 0.5), 0.0, 1.0, "threshold"),
-        ways=int(_within(told.get("ways", 1), 1, MAX_WAYS, "ways")),
+        overlap=_within(metadata.get("overlap", 0.125), 0.0, 0.75, "overlap"),
+        mean=_triple(metadata.get("mean", 0.0), "mean"),
+        std=_triple(metadata.get("std", 1.0), "standard deviation"),
+        threshold=_within(metadata.get("threshold", 0.5), 0.0, 1.0, "threshold"),
+        ways=int(_within(metadata.get("ways", 1), 1, MAX_WAYS, "ways")),
         output=output.name,
         channels=channels,
         gives_classes=gives_classes,
@@ -139,7 +139,7 @@ def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -
     return replace(card, overlap=max(card.overlap, 0.05))
 
 
-def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], bool]:
+def _tile_of(model: OnnxModel, metadata: dict[str, Any]) -> tuple[tuple[int, int], bool]:
     """Return (height, width) of the input, its own where it is fixed, else as given; and whether channels come last."""
     if len(model.inputs) != 1:
         raise ModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
@@ -153,7 +153,7 @@ def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], b
             "(1, height, width, 3), RGB"
         )
     sides = port.shape[1:3] if last else port.shape[2:]
-    wanted = int(told.get("tile", _DEFAULT_TILE))
+    wanted = int(metadata.get("tile", _DEFAULT_TILE))
     free = max(_TILE_STEP, round(wanted / _TILE_STEP) * _TILE_STEP)
     tile = sides[0] or free, sides[1] or free
     if not all(_TILE_STEP <= side <= _MAX_TILE for side in tile):
@@ -265,18 +265,18 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
     inputs, outputs = properties.get("mlm:input"), properties.get("mlm:output")
     if not inputs or not outputs:
         return {}
-    told = _read_scaling(inputs[0])
+    metadata = _read_scaling(inputs[0])
     tasks = outputs[0].get("tasks") or properties.get("mlm:tasks") or []
     if tasks:
-        told["model_type"] = next(("Segmentor" for task in tasks if "segmentation" in task), tasks[0])
+        metadata["model_type"] = next(("Segmentor" for task in tasks if "segmentation" in task), tasks[0])
     if classes := outputs[0].get("classification:classes"):
-        told["classes"] = {int(each["value"]): str(each["name"]) for each in classes}
+        metadata["classes"] = {int(each["value"]): str(each["name"]) for each in classes}
     if "gsd" in properties:
-        told["resolution_m"] = float(properties["gsd"])
+        metadata["resolution_m"] = float(properties["gsd"])
     shape = inputs[0].get("input", {}).get("shape", [])
     if len(shape) == 4 and min(shape[2:]) > 0:
-        told["tile"] = int(shape[2])
-    return told
+        metadata["tile"] = int(shape[2])
+    return metadata
 
 
 def _read_scaling(described: dict[str, Any]) -> dict[str, Any]:
@@ -308,7 +308,7 @@ def _affine(step: dict[str, Any]) -> tuple[float, float]:
 
 def _triple(value: Any, what: str) -> tuple[float, float, float]:
     """Return three finite numbers; one is repeated."""
-    numbers = [float(one) for one in (value if isinstance(value, list | tuple) else [value])]
+    numbers = [float(number) for number in (value if isinstance(value, list | tuple) else [value])]
     numbers = numbers * 3 if len(numbers) == 1 else numbers
     if len(numbers) != 3 or not all(-1e4 < number < 1e4 for number in numbers):
         raise ValueError(f"{what} {value}")
