@@ -163,14 +163,14 @@ def tour():
 
 
 def choose(messages, window):
-    """Two places fit, of which the likelier is listed behind: the other is looked at, and chosen."""
+    """Two places fit: the second is looked at, and chosen."""
     session = importlib.import_module("roadgeo_qgis.session")
     location = json.loads(Path(ANSWER["locate"]["results"]["OUTPUT_FOLDER"], "drone_location.json").read_text("utf-8"))
     center = location["center"]
     reason = "two places fit almost equally: the roads that the picture shows explain one of them only 6 times better; "
     reason += "a pixel size, a heading or a part of the map would decide between them"
-    likelier = {"center": {**center, "lon": center["lon"] - 0.01, "lat": center["lat"] + 0.01}, "log10_odds": 1.2}
-    location |= {"status": "ambiguous", "reason": reason, "log10_odds": 0.4, "alternatives": [likelier]}
+    second = {"center": {**center, "lon": center["lon"] - 0.01, "lat": center["lat"] + 0.01}, "log10_odds": -0.8}
+    location |= {"status": "ambiguous", "reason": reason, "log10_odds": 0.8, "alternatives": [second]}
     parameters = {"MASK": TASK["picture"], "REFERENCE": "porto-streets", "OUTPUT_FOLDER": "TEMPORARY_OUTPUT"}
     found = session.Finding("drone", TASK["picture"], "", "", location, parameters)
     messages.announce("locatemask", found)

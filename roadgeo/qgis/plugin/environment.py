@@ -74,12 +74,12 @@ def install(python: str, source: str, folder: Path, session: Session) -> str:
 def _choose(python: str, session: Session) -> str:
     """Return the Python that was named, or the first that is new enough and can make environments."""
     named = [python] if python else find_pythons(os.environ, Path.home())
-    for candidate in named:
+    for path in named:
         try:
-            session.tell(candidate, "-I", "-c", _TRIAL)
+            session.tell(path, "-I", "-c", _TRIAL)
         except QgsProcessingException:
             continue
-        return candidate
+        return path
     looked = ", ".join(named) or "none was found"
     raise QgsProcessingException(
         f"roadgeo needs Python 3.11 or newer with venv and pip, and there is none ({looked}); install one from "

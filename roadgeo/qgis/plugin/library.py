@@ -41,11 +41,21 @@ class Reference:
 
 @dataclass(frozen=True)
 class Place:
-    """A place of a picture: longitude and latitude of its middle, log10 odds or None, and the map ("" if unknown)."""
+    """A place of a picture.
+
+    Attributes
+    ----------
+    lon, lat : float
+        Its middle.
+    less : float
+        Decimal logarithm of how many times less likely it is than the best, at least; 0 for the best.
+    map : str
+        Name of the reference that holds it, "" if unknown.
+    """
 
     lon: float
     lat: float
-    log10_odds: float | None
+    less: float
     map: str
 
 
@@ -76,16 +86,19 @@ def find_reference(value: str) -> Reference:
 
 
 def list_places(location: dict[str, Any]) -> list[Place]:
-    """List the places at which a picture may lie, the likeliest first, with the maps that hold them."""
-    best = [{"center": location["center"], "log10_odds": location["log10_odds"]}] if location["center"] else []
-    maps = sorted(list_references(), key=lambda held: held.name != location["reference"])
-    boxes = [(held.name, _box(held.file)) for held in maps if held.file]
+    """List the places at which a picture may lie, the best first, with the maps that hold them."""
+    lead = location["log10_odds"] or 0.0
+    best = [{"center": location["center"], "log10_odds": 0.0}] if location["center"] else []
+    maps = sorted(list_references(), key=lambda known: known.name != location["reference"])
+    boxes = [(known.name, _box(known.file)) for known in maps if known.file]
     places = []
     for found in [*best, *location["alternatives"]]:
-        lon, lat = found["center"]["lon"], found["center"]["lat"]
+        lon, lat, odds = found["center"]["lon"], found["center"]["lat"], found["log10_odds"] or 0.0
         on = (name for name, box in boxes if box.contains(QgsPointXY(lon, lat)))
-        places.append(Place(lon, lat, found["log10_odds"], next(on, "")))
-    return sorted(places, key=lambda place: math.inf if place.log10_odds is None else -place.log10_odds)
+        # On its own map a place has odds against the best; where it is itself the best there, the lead is the least.
+        less = -odds if odds < 0.0 else max(lead, 0.0)
+        places.append(Place(lon, lat, less if places else 0.0, next(on, "")))
+    return places
 
 
 def _box(file: str) -> Any:

@@ -28,7 +28,7 @@ _COLUMNS = ("Latitude, longitude", "Map", "From the first", "How likely")
 
 
 class PlacesDialog(QDialog):
-    """The places, the likeliest first.
+    """The places, the best first.
 
     Attributes
     ----------
@@ -112,12 +112,9 @@ def _measure(place: Place, other: Place) -> float:
 
 
 def _compare(best: Place, place: Place) -> str:
-    """Return how likely a place is beside the best one, rounded as a person would."""
-    if best.log10_odds is None or place.log10_odds is None:
-        return ""
+    """Return how likely a place is beside the best, rounded as a person would."""
     if place is best:
         return "best"
-    less = best.log10_odds - place.log10_odds
-    if less < 0.2:
+    if place.less < 0.2:
         return "as likely"
-    return "a million times less, or more" if less > 6 else f"{float(f'{10**less:.1g}'):,.0f} times less"
+    return "a million times less, or more" if place.less > 6 else f"{float(f'{10**place.less:.1g}'):,.0f} times less"

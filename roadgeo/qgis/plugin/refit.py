@@ -92,12 +92,13 @@ def fit(matches: Sequence[Match]) -> Fit:
 
     Four are met exactly. It starts from the linear solution in normalised coordinates (Hartley & Zisserman, 4.1, 4.4).
     """
-    chosen = [match for match in matches if match.on]
+    on = np.array([match.on for match in matches], bool)
     nothing = Fit(None, [math.nan] * len(matches))
-    if len(chosen) < FEWEST:
+    if on.sum() < FEWEST:
         return nothing
-    source = np.array([(match.column, match.row) for match in chosen])
-    target = np.array([(match.x, match.y) for match in chosen])
+    pixels = np.array([(match.column, match.row) for match in matches])
+    ground = np.array([(match.x, match.y) for match in matches])
+    source, target = pixels[on], ground[on]
     from_source, from_target = _normaliser(source), _normaliser(target)
     uv, xy = place(from_source, source), place(from_target, target)
     system = np.zeros((2 * len(uv), 9))
@@ -112,9 +113,7 @@ def fit(matches: Sequence[Match]) -> Fit:
     if matrix is None:
         return nothing
     matrix = np.linalg.inv(from_target) @ matrix @ from_source
-    every = place(matrix, np.array([(match.column, match.row) for match in matches]))
-    gaps = every - np.array([(match.x, match.y) for match in matches])
-    return Fit(matrix / matrix[2, 2], np.hypot(*gaps.T).tolist())
+    return Fit(matrix / matrix[2, 2], np.hypot(*(place(matrix, pixels) - ground).T).tolist())
 
 
 def place(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
