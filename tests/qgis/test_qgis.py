@@ -88,6 +88,21 @@ def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) ->
     assert f"warning: elsewhere: {refused['results']['REASON']}" in refused["said"]
 
 
+def test_a_picture_that_fits_on_two_maps_is_shown_both_and_located_where_it_is_known_to_be(
+    qgis: Qgis, porto: Path
+) -> None:
+    moved = geopandas.read_file(ROADS).to_crs(32629)
+    moved.set_geometry(moved.translate(20_000)).to_file(qgis.folder / "moved_roads.gpkg")
+    qgis.run("buildreference", ROADS=qgis.folder / "moved_roads.gpkg", KINDS="all", OUTPUT=qgis.folder / "moved.gpkg")
+    wanted = {"MASK": MASKS["drone"].path, "OUTPUT_FOLDER": qgis.folder / "twice"}
+    done = qgis.run("locatemask", **wanted)
+    assert done["results"]["STATUS"] == "ambiguous"
+    assert set(done["layers"]) == {"porto roads", "moved roads"}
+    near = qgis.run("locatemask", **wanted, NEAR="-8.608,41.1525 [EPSG:4326]", NEAR_RADIUS=1000)
+    assert near["results"]["STATUS"] == "located"
+    assert "porto roads" in near["layers"]
+
+
 def test_errors_are_shown_in_the_words_of_qgis(qgis: Qgis, porto: Path) -> None:
     wanted = {"MASK": MASKS["drone"].path, "OUTPUT_FOLDER": qgis.folder / "errors", "REFERENCE": porto}
     absent = qgis.run("locatemask", **{**wanted, "REFERENCE": qgis.folder / "none.gpkg"})
