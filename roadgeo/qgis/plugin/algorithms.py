@@ -35,12 +35,12 @@ __all__ = ["ALGORITHMS"]
 #: Name of the layer of residuals, whose arrows are drawn longer than they are.
 _RESIDUALS = "residuals × 20"
 
-
-#: The help page: title and text of each algorithm, by its name.
+#: The help page: title and text of each algorithm, by its name. QGIS makes a paragraph of every line.
 _PAGE = Path(__file__).parent / "help.html"
 _SECTION = r'<h2 id="(\w+)">(.*?)</h2>\s*(.*?)\s*(?=<h2|</body)'
 _HELP: dict[str, tuple[str, str]] = {
-    name: (unescape(title), text) for name, title, text in re.findall(_SECTION, _PAGE.read_text("utf-8"), re.DOTALL)
+    name: (unescape(title), text.replace("\n", " "))
+    for name, title, text in re.findall(_SECTION, _PAGE.read_text("utf-8"), re.DOTALL)
 }
 
 
@@ -71,7 +71,7 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def shortDescription(self) -> str:
         """First sentence of the help."""
-        return unescape(re.sub(r"<[^>]+>", "", _HELP[self.NAME][1])).replace("\n", " ").split(". ")[0] + "."
+        return unescape(re.sub(r"<[^>]+>", "", _HELP[self.NAME][1])).split(". ")[0] + "."
 
     def shortHelpString(self) -> str:
         """Text beside the parameters: the help, then every parameter with its hint."""
