@@ -91,7 +91,7 @@ def list_places(location: dict[str, Any]) -> list[Place]:
     best = [{"center": location["center"], "log10_odds": 0.0}] if location["center"] else []
     maps = sorted(list_references(), key=lambda known: known.name != location["reference"])
     boxes = [(known.name, _box(known.file)) for known in maps if known.file]
-    places = []
+    places: list[Place] = []
     for found in [*best, *location["alternatives"]]:
         lon, lat, odds = found["center"]["lon"], found["center"]["lat"], found["log10_odds"] or 0.0
         on = (name for name, box in boxes if box.contains(QgsPointXY(lon, lat)))
