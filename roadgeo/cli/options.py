@@ -157,7 +157,7 @@ def row(names: str, shown: str | tuple[str, ...] | None, group: str, text: str, 
     group : str
         Under which heading of the help it stands.
     text : str
-        Its help; what stands behind the first sentence is shown by --help-all only.
+        Its help; all behind the first sentence is shown by --help-all only.
     **more
         As for `click.option`; `rare`.
     """
@@ -328,7 +328,7 @@ _SHARED = {
     "resampling": row("--resampling", ("nearest", "bilinear", "cubic", "lanczos"), RESULTS,
         "How values between pixels are found; nearest for classes.", default="cubic", show_default=True, rare=True),
     "compression": row("--compression", ("deflate", "zstd", "jpeg", "webp"), RESULTS,
-        "Of what is drawn. jpeg and webp, for photographs only, make them five times smaller, with some loss.",
+        "Compression of rasters. jpeg and webp, for photographs only, make them five times smaller, with some loss.",
         default="deflate", show_default=True, rare=True),
     "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
     "segmenters": row("--segmenter segmenters", "NAME|MODEL.onnx", IMAGE,

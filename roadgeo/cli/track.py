@@ -79,7 +79,7 @@ knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by ro
 Frames of an archive are in no order: with --unordered each is laid on each other, by what the pictures show or by the
 roads of the masks; what overlaps is solved together, located together, and each frame is placed.
 
-With --focal the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
+With --focal the place of the camera is computed, too, which is not the ground in the frame's middle. That is what an
 autopilot needs; --mavlink sends it as soon as it is known, for PX4 (GLOBAL_POSITION_SENSOR) and ArduPilot
 (EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --focal, the frame's middle. It needs
 pymavlink.

@@ -38,7 +38,7 @@ _OPTIONS = (
     take("json", group=RESULTS),
     row("--report", "", RESULTS, "Of each image, a page for the browser: IMAGE_verify.html."),
     row("--fix", "", RESULTS,
-        "Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and "
+        "For each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and "
         "IMAGE_fixed.points, for the QGIS Georeferencer."),
     row("--in-place", "", RESULTS, "Correct the georeference of GeoTIFFs that are off themselves."),
     row("--tolerance", "METRES", OTHERS,

@@ -29,7 +29,7 @@ __all__ = ["FLIGHT_NOISE", "Flight", "FlightOptions", "simulate_flight"]
 #: Draws of a flight before it is given up.
 MAX_TRIES = 3000
 
-#: Faults of one frame; `FlightOptions.hidden` holds those of all frames.
+#: Faults of one frame; `FlightOptions.hidden` holds all frames' faults.
 FLIGHT_NOISE = NoiseModel(
     missing=(0.10, 0.15),
     false_roads=(0.02, 0.06),
@@ -54,7 +54,7 @@ class FlightOptions:
     gsd_m : range
         Metres per pixel in the middle of the frame; it varies by some hundredths on the way, as height does.
     tilt_deg : range
-        Of the camera from the vertical, towards any side; it sways by `sway_deg`.
+        Greatest angle of the camera from the vertical, towards any side; it sways by `sway_deg`.
     turn_deg : float
         Standard deviation of the change of course from one frame to the next.
     sway_deg : float

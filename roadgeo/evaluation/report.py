@@ -1,4 +1,4 @@
-"""What an evaluation shows: sentences and tables, as CSV and as one page of the layers that all pages show."""
+"""The findings of an evaluation: sentences and tables, as CSV and as one page of the layers that all pages show."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ class Tracker:
             None if self._pose is None or frame.motion is None else predict(self._pose, frame.motion, frame.motion_px)
         )
         if predicted is None:
-            why = "its motion is not known" if frame.motion is None else "its motion is that of no camera"
+            why = "its motion is not known" if frame.motion is None else "no camera moves like this"
             return Tracked(frame, "lost", why, known_at)
         return self._judge(waiting, predicted, known_at, status)
 
@@ -262,7 +262,7 @@ class Tracker:
         if mosaic is None:
             self._window = [waiting]
             self._forget()
-            return [Tracked(frame, "lost", "the motion is that of no camera; begun anew", frame.number)]
+            return [Tracked(frame, "lost", "no camera moves like this; begun anew", frame.number)]
         query = _read(mosaic)
         n_seen = 0 if query is None else len(query.scene.intersections)
         least = max(self.options.fewest_intersections, self._looked_at + self.options.more_intersections)

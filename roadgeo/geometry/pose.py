@@ -127,7 +127,7 @@ def find_pose(
 
 
 class SeenCorners(NamedTuple):
-    """What is fitted to, and the prior on the focal length.
+    """The corners fitted to, and the prior on the focal length.
 
     `pixels` (4, 2) are the corners from the middle of the frame, y up; `ground` (4, 2) where they lie, metres;
     `weights` (8, 8) whiten how far off they are; `log_focal` and its standard deviation come from usual lenses.
@@ -185,7 +185,7 @@ def pinhole_residuals(p: FloatArray, seen: SeenCorners) -> FloatArray:
     """Return how far off corners are, whitened, and the focal length from usual ones, (..., 9) of parameters (..., 7).
 
     The parameters are x and y where the axis meets the ground, log metres per pixel there, the heading, the tilt about
-    two axes were the focal length that of `log_focal`, and the log of the focal length, with which the tilt grows in
+    two axes were the focal length as in `log_focal`, and the log of the focal length, with which the tilt grows in
     proportion. Infinite where a corner does not lie below the horizon.
     """
     positions, rotations = _place(p, seen.log_focal)

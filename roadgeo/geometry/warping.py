@@ -155,7 +155,7 @@ def source_pixels(
         pixels = to_pixel(points)
         return pixels if lens is None else lens.bend(pixels)
 
-    # What the camera makes of a plane bends more than what a change of the CRS does.
+    # A camera bends a plane more than a change of the CRS does.
     for step in _NODE_STEPS:
         if 4 * step > min(size):
             continue

@@ -29,7 +29,7 @@ NUMBERS = (
 
 
 def attributes(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of every column: plain, None where there is none; files without their folders.
+    """Return the value of every column: plain, or None; files without their folders.
 
     Parameters
     ----------

@@ -117,7 +117,7 @@ def _labels(mask: RoadMask) -> AnyArray:
 
 
 def _tags(subject: Subject) -> dict[str, str]:
-    """Add the source as metadata, for `gdalinfo`; the homography is that of the drawn image."""
+    """Add the source as metadata, for `gdalinfo`; the homography belongs to the drawn image."""
     location = subject.location
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",

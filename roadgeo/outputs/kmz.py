@@ -19,7 +19,7 @@ from roadgeo.outputs.subject import Subject
 
 __all__ = ["write_kmz"]
 
-#: Pixels of the picture, and the longer side of what it is drawn from.
+#: Pixels of the picture, and the longer side of its source.
 _PIXELS, _SIDE = 4_000_000, 2500
 
 #: 11 km from a pole a picture in degrees is as wide as it is deformed.

@@ -86,7 +86,7 @@ def write_location(
 ) -> Written:
     """Write the outputs of a location, all files or none; if a picture cannot be drawn, the JSON alone.
 
-    Files of an earlier run under these names that show a place are removed where there is none now, so that stale
+    Files of an earlier run under these names that show a place are removed where no place is known now, so that stale
     results are not mistaken for this run's.
 
     Parameters

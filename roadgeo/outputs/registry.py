@@ -143,14 +143,14 @@ REGISTRY = {
 
 
 def offered() -> list[str]:
-    """Names that `--also` takes: ours, and those of plugins."""
+    """Names that `--also` takes: ours, and plugins' names."""
     from roadgeo.plugins import OUTPUTS, find_plugins
 
     return sorted({*ALSO, *find_plugins(OUTPUTS)})
 
 
 def find_outputs(names: Iterable[str]) -> list[Output]:
-    """Return outputs by their names, each once: ours, or else those of plugins.
+    """Return outputs by their names, each once: ours, or else plugins' outputs.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def _load(name: str) -> Output:
 
 
 def result_endings() -> tuple[str, ...]:
-    """Return how names of results end, ours and those of plugins; all installed packages are asked for it."""
+    """Return how names of results end, ours and plugins'; all installed packages are asked for it."""
     return tuple(output.ending for output in (*REGISTRY.values(), *_installed()) if "{" not in output.ending)
 
 

@@ -161,7 +161,7 @@ class Subject:
 
     @cached_property
     def stored(self) -> Homography:
-        """From the picture's pixels to those of its file, where that is to be turned (see `storage.orientation`)."""
+        """From the picture's pixels to its file's, where that is to be turned (see `storage.orientation`)."""
         return Homography(stored_from_upright(read_orientation(self.picture), self.size))
 
     def stored_control_points(self) -> list[tuple[float, float, float, float]]:

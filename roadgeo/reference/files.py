@@ -63,7 +63,7 @@ _PATIENCE_S = 0.5
 
 
 class _StaleError(IndexFormatError):
-    """The index was built from other intersections than those of the GeoPackage beside it."""
+    """The index was built from other intersections than the GeoPackage beside it has."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], I
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
-    """Return whether the index is that of the GeoPackage beside it.
+    """Return whether the index belongs to the GeoPackage beside it.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
 
 
 def reference_digest(path: str | os.PathLike[str]) -> str:
-    """Return the digest of the intersections that a reference's index was built from; "" where there is none to read.
+    """Return the digest of the intersections that a reference's index was built from; "" without an index to read.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]
 
 
 def identities(path: str | os.PathLike[str]) -> list[tuple[int, int] | None]:
-    """Return an identity of each file of a reference, which changes when it is replaced; None where there is none."""
+    """Return an identity of each file of a reference, which changes when it is replaced; None for a missing file."""
     paths = reference_paths(path)
     found: list[tuple[int, int] | None] = []
     for path in (paths.geopackage, paths.index):

@@ -1,4 +1,4 @@
-"""What a reference is, and whether it is sound: in one piece or in shards."""
+"""A reference's contents, and whether it is sound: in one piece or in shards."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _check_content(path: Path, network: RoadNetwork | None, expected: ReferenceI
         yield f"{path} is stale: it was built from other intersections; {remedy(path)}"
     elif expected is not None and manifest["roadgeo"] == __version__:  # another may well have built another index
         if index.meta.get("index_options") != expected.meta["index_options"]:
-            yield f"{path}: its options are not those of its GeoPackage; {remedy(path)}"
+            yield f"{path}: its options differ from its GeoPackage's; {remedy(path)}"
             return
         arrays = expected.arrays()
         for name, array in index.arrays().items():

@@ -67,18 +67,18 @@ class ShardEntry:
     Attributes
     ----------
     name : str
-        Of its files.
+        Name of its files.
     ground, reach : (west, south, east, north)
         Degrees: the ground that is its own, and that with its margin.
     crs : str
-        Of its plane; "" where it has too few intersections to be searched, and no files.
+        CRS of its plane; "" where it has too few intersections to be searched, and no files.
     intersections, own_intersections : int
         In all, and on its own ground.
     road_km : float
     bytes : int
-        Of both files.
+        Bytes of both files.
     digest : str
-        Of its intersections (see `network_file.network_digest`).
+        Digest of its intersections (see `network_file.network_digest`).
     """
 
     name: str
@@ -98,7 +98,7 @@ class ShardEntry:
         Raises
         ------
         ValueError
-            They are none.
+            They are no entry.
         """
         if type(values) is not dict or values.keys() != cls.__dataclass_fields__.keys():
             raise ValueError("a shard lacks an entry")
@@ -159,7 +159,7 @@ class Manifest:
 
 
 def manifest_path(path: str | os.PathLike[str]) -> Path | None:
-    """Return the manifest of a sharded reference, given that, its folder or what that is called; None if it is none."""
+    """Return the manifest of a sharded reference, given its path, its folder or their name, or None."""
     given = Path(path)
     if given.name == _MANIFEST:
         given = given.parent
@@ -308,7 +308,7 @@ class ShardedReference:
     def index_of(self, location: Location) -> ReferenceIndex:
         """Return the index of the shard that a location lies on; of the last where there is no place.
 
-        Of a frame that a shard may not show wholly it is that of the coarse map.
+        For a frame that a shard may not show wholly it comes from the coarse map.
         """
         center = location.center
         if center is None or location.footprint is None:

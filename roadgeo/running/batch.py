@@ -225,7 +225,7 @@ class Locating:
         except RoadgeoError as error:
             return self.failed(task, _code_of(error), str(error))
         except UnicodeEncodeError:  # libraries take no other names
-            reason = f"{task.query}: its name is no text, or that of the picture; rename it"
+            reason = f"{task.query}: its name is no text, or the picture's; rename it"
             return self.failed(task, "INVALID", reason)
         except MemoryError:
             reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"

@@ -296,7 +296,7 @@ async def _take(request: Request, folder: Path) -> Job:
 
 
 def _copy(old: Job, folder: Path) -> None:
-    """Copy an image, and what was seen in it, into another folder."""
+    """Copy an image, with the roads seen in it, into another folder."""
     shutil.copyfile(old.path, folder / SENT / old.image)
     seen = old.folder / OWN / SEEN
     if seen.is_file():

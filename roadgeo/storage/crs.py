@@ -49,7 +49,7 @@ def known_crs(crs: Any) -> CRS:
     Raises
     ------
     CrsError
-        It names a file that is none of PROJ's own.
+        It names a file that PROJ does not own.
     pyproj.exceptions.CRSError
         It is no CRS.
     """
@@ -66,7 +66,7 @@ def name_crs(crs: Any) -> str:
     NoCrsError
         It is no CRS, or not one of places on a map.
     CrsError
-        It names a file that is none of PROJ's own.
+        It names a file that PROJ does not own.
     """
     from pyproj.exceptions import CRSError
 

@@ -34,7 +34,7 @@ _CRS = re.compile(
 _WINDOWS = (1 << 12, 1 << 24)  # a CRS is decoded out of so many bytes
 #: The CRS of GML, and the markup that could hide it.
 _SRS_NAME = re.compile(rb"srsName\s*=\s*(\"[^\"]*|'[^']*)")
-#: What sends MapInfo's reader to other tables.
+#: Words that send MapInfo's reader to other tables.
 _OTHER_TABLES = re.compile(rb"open\s+table|create\s+view|isseamless", re.IGNORECASE)
 _HEAD = 1 << 13
 

@@ -475,7 +475,7 @@ def test_options_that_nobody_wrote_are_found(
     stored = meta["index_options"] | options if options else options
     paths = write_reference(tmp_path / "grid", network, (meta | {"index_options": stored}, arrays))
     (problem,) = check_reference(paths.geopackage)
-    assert "its options are not those of its GeoPackage" in problem
+    assert "its options differ from its GeoPackage's" in problem
 
 
 def test_a_stale_index_and_an_unnoticed_edit_are_found(checked: Path) -> None:

@@ -84,15 +84,15 @@ def test_a_divided_map_answers_as_the_whole_does(town, monkeypatch, capsys):
     for out, more in (("whole", []), ("divided", divided), ("divided", [*divided, "--skip-existing"])):
         assert main([*asked, "-o", out, "--effort", "quick", *more]) == 1
         found[out] = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        for one, other in zip(found["whole"], found[out], strict=True):
+        for item, other in zip(found["whole"], found[out], strict=True):
             same = ("query", "status", "reference", "attribution", "reference_digest", "reason_code", "crs", "options")
-            assert [one[key] for key in same] == [other[key] for key in same]
-            if one["center"]:
-                assert np.allclose(one["footprint"], other["footprint"], atol=1e-6)
-                assert other["log10_odds"] == pytest.approx(one["log10_odds"], abs=1.5)
-    told = [(one["status"], one["reference"]) for one in found["divided"]]
-    assert told[:3] == [("located", "town"), ("located", "town"), ("located", "hamlet")]
-    assert [status for status, _ in told[3:]] == ["not_located", "error"]
+            assert [item[key] for key in same] == [other[key] for key in same]
+            if item["center"]:
+                assert np.allclose(item["footprint"], other["footprint"], atol=1e-6)
+                assert other["log10_odds"] == pytest.approx(item["log10_odds"], abs=1.5)
+    values = [(result["status"], result["reference"]) for result in found["divided"]]
+    assert values[:3] == [("located", "town"), ("located", "town"), ("located", "hamlet")]
+    assert [status for status, _ in values[3:]] == ["not_located", "error"]
     assert sorted(path.name for path in (town / "whole").iterdir()) == sorted(
         path.name for path in (town / "divided").iterdir()
     )
@@ -120,8 +120,8 @@ def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch,
         path.write_bytes(b"nothing")
     asked = ["locate", str(town / "b.png"), "-r", "town.shards", "--json", "-q", "--effort", "quick"]
     assert main([*asked, "--engine", "dask", "--jobs", "2", "--divide-map"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert (told["status"], told["reason_code"]) == ("error", "no_reference")
+    output = json.loads(capsys.readouterr().out)
+    assert (output["status"], output["reason_code"]) == ("error", "no_reference")
 
 
 @pytest.mark.parametrize("more", [[], ["--engine", "dask", "--method", "pair"], ["--engine", "dask", "--explain"]])

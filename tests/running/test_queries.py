@@ -79,7 +79,7 @@ def test_plugins_alone_have_no_more_ways_however_large_the_photograph(
     monkeypatch.setattr(photographs, "call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
     locate_query(str(photo), [], reading=ReadOptions(segment="always", segmenters=("one", "another")))
     assert taken
-    assert not any("ways" in one for one in taken)
+    assert not any("ways" in item for item in taken)
 
 
 @pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
@@ -112,7 +112,7 @@ def test_the_second_look_shows_the_photograph_more_ways(
         assert taken == ["", ", a lower threshold", ", shown alone", ", shown alone"]
         return
     assert (len(taken) > 1 and taken[1].endswith("shown 2 ways")) == ways
-    assert not any("ways" in one for one in taken[:1] + taken[2:])
+    assert not any("ways" in item for item in taken[:1] + taken[2:])
 
 
 @pytest.mark.parametrize(("ways", "expected"), [(1, [(0.5, 1)]), (2, [(1.0, 1), (0.5, 1)])])
@@ -239,9 +239,9 @@ def test_what_was_seen_is_told_and_drawn(
 ) -> None:
     given = [str(photo), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path), "--report"]
     assert main(["locate", *given]) == 0
-    told = capsys.readouterr()
-    assert "looking for the scale of" in told.err
-    assert "times the mask's size" not in told.out
+    output = capsys.readouterr()
+    assert "looking for the scale of" in output.err
+    assert "times the mask's size" not in output.out
     page = (tmp_path / "flight_report.html").read_text()
     assert page.count('<g class="probability off"><image') == 1
     assert main(["locate", str(MASK.path), "-r", str(porto), "-o", str(tmp_path), "--report"]) == 0
@@ -256,7 +256,9 @@ def test_no_scale_is_looked_for_in_vain(
     calls = []
     monkeypatch.setattr(photographs, "estimate_gsd", lambda _: stated)
     monkeypatch.setattr(photographs, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
-    monkeypatch.setattr(photographs, "segment", lambda *given, **told: calls.append("shown") or segment(*given, **told))
+    monkeypatch.setattr(
+        photographs, "segment", lambda *given, **reported: calls.append("shown") or segment(*given, **reported)
+    )
     query = ReadOptions(segmenters=(model,))
     sighting = locate_query(str(photo), [open_reference(porto)], reading=query)
     assert sighting.location.located
@@ -385,7 +387,7 @@ def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(StopIteration):
         locate_query(str(MASK.path), [], reading=ReadOptions(fused_with=(str(MASK.path),)))
     assert taken
-    assert not any("ways" in one for one in taken)
+    assert not any("ways" in item for item in taken)
 
 
 def test_two_exposures_are_fused(

@@ -251,12 +251,12 @@ def png(width: int, height: int, depth: int = 8, colour: int = 0) -> bytes:
 
 class TestSizes:
     @pytest.mark.parametrize(
-        ("side", "told"),
+        ("side", "reported"),
         [(100_000, "100000 x 100000 pixels; expected 32 to 20000"), (2**31 - 1, "not a raster that can be read")],
     )
-    def test_a_header_says_too_much(self, tmp_path, side, told):
+    def test_a_header_says_too_much(self, tmp_path, side, reported):
         (tmp_path / "a.png").write_bytes(png(side, side))
-        with pytest.raises(MaskError, match=told):
+        with pytest.raises(MaskError, match=reported):
             read_mask(tmp_path / "a.png")
 
     @pytest.mark.parametrize("bits", [24, 32])
@@ -358,7 +358,7 @@ def test_what_a_raster_says_of_itself_is_kept_where_it_is_turned(tmp_path: Path)
     rng = np.random.default_rng(0)
     rgba = rng.integers(0, 256, (40, 60, 4)).astype(np.uint8)
     with open_raster(save_turned(tmp_path / "alpha.png", rgba, 5)) as raster:
-        assert [one.name for one in raster.colorinterp] == ["red", "green", "blue", "alpha"]
+        assert [item.name for item in raster.colorinterp] == ["red", "green", "blue", "alpha"]
         np.testing.assert_array_equal(raster.dataset_mask(), np.where(rgba[..., 3] > 0, rgba[..., 3], 0))
     classes = PIL.Image.fromarray(rng.integers(0, 3, (40, 60)).astype(np.uint8), "P")
     classes.putpalette([0, 0, 0, 250, 10, 10, 20, 30, 240])
@@ -384,8 +384,8 @@ def test_control_points_are_turned(tmp_path: Path, roads: np.ndarray) -> None:
 def test_what_is_too_large_to_be_turned_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_turned(tmp_path / "large.png", np.zeros((100, 200, 3), np.uint8), 8)
     monkeypatch.setattr("roadgeo.storage.rasters._MAX_TURNED_BYTES", 1000)
-    told = r"its orientation is 8.* too large for that.*: save it upright"
-    with pytest.raises(MaskError, match=told), open_raster(path):
+    reported = r"its orientation is 8.* too large for that.*: save it upright"
+    with pytest.raises(MaskError, match=reported), open_raster(path):
         pass
 
 
@@ -448,14 +448,14 @@ def test_a_cause_is_named_where_something_speaks_for_it(
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1 << 41, 0, free))
     with pytest.raises(OutputError) as raised, writing_raster(tmp_path / "a.tif"):
         raise rasterio.errors.RasterioError(reason)
-    told = str(raised.value)
-    assert f"{reason}; {doubt}" in told if doubt else told.endswith(reason)
+    reported = str(raised.value)
+    assert f"{reason}; {doubt}" in reported if doubt else reported.endswith(reason)
 
 
 def test_text_that_is_called_an_image_is_said_to_be_text(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("404: no such file\n", encoding="utf-8")
-    told = r"a\.jpg: is text, whatever its name says; expected an image"
-    with pytest.raises(MaskError, match=told), open_raster(tmp_path / "a.jpg"):
+    output = r"a\.jpg: is text, whatever its name says; expected an image"
+    with pytest.raises(MaskError, match=output), open_raster(tmp_path / "a.jpg"):
         pass
 
 

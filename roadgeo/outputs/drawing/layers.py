@@ -1,4 +1,4 @@
-"""What pictures and pages show: layers of marks in one frame (x right, y down), and how each layer looks.
+"""Contents of pictures and pages: layers of marks in one frame (x right, y down), and how each layer looks.
 
 Both writers, of SVG and of pixels, take colours and widths from here.
 """

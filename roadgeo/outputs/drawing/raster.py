@@ -112,7 +112,7 @@ class Canvas:
             cv2.fillPoly(self.image, [np.rint(tip).astype(np.int32)], color, cv2.LINE_AA, SHIFT)
 
     def _blend(self, picture: AnyArray, box: Box) -> None:
-        """Lay a picture over a part of the canvas; what reaches beyond is cut off."""
+        """Lay a picture over a part of the canvas; pixels beyond it are cut off."""
         first = np.rint((np.array(box[:2]) - self.corner) * self.scale).astype(int)
         size = np.maximum(np.rint(np.array(box[2:]) * self.scale).astype(int), 1)
         way = cv2.INTER_AREA if size[0] < picture.shape[1] else cv2.INTER_NEAREST

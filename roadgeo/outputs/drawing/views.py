@@ -40,7 +40,7 @@ __all__ = [
 #: A circle that holds a corner's true position with 95 %, in rms distances.
 SIGMAS = 1.73
 
-#: Layers of a place that need no script and no scale of their own: what pictures show of it.
+#: Layers of a place that need no script and no scale of their own: as pictures show them.
 STILL = ("ground", "map-roads", "query-roads", "footprint", "matches")
 
 _GREY: Color = (150, 155, 163)
@@ -136,7 +136,7 @@ class Shown:
 
     @property
     def subject(self) -> str:
-        """What the image is, in words: "photograph" or "mask"."""
+        """Kind of the image, in words: "photograph" or "mask"."""
         return "mask" if self.photograph is None and self.mask.probability is None else "photograph"
 
     @property

@@ -102,7 +102,7 @@ def _roads_in(place: Georeference, index: ReferenceIndex) -> list[Lines]:
 
 
 def _numbers(document: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Label and value of what is known."""
+    """Label and value of all that is known."""
     found, center = document.get("displacement"), document.get("center")
     rows = []
     if found is not None:

@@ -155,7 +155,7 @@ class MatchDock(QDockWidget):
     # --- opening ------------------------------------------------------------------------------------------------------
 
     def _located(self) -> list[tuple[str, str, str]]:
-        """List name, picture and points of what was located in this project, the current layer first."""
+        """List name, picture and points of the pictures located in this project, the current layer first."""
         found = {}
         for layer in [iface.activeLayer(), *QgsProject.instance().layerTreeRoot().layerOrder()]:
             picture, points = (layer.customProperty(key) if layer else "" for key in (PICTURE_KEPT, POINTS_KEPT))

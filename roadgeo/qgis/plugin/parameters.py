@@ -350,7 +350,7 @@ LOCALIZABILITY = (
     replace(_REFERENCE, hint="What Build road reference made: one of the list, or a file.", settings={}),
     _option(
         "evaluate", "--height", "Height above ground, metres",
-        "Of the flight. With the focal length it gives the pixel size.", defaultValue=400.0,
+        "Height of the flight. With the focal length it gives the pixel size.", defaultValue=400.0,
     ),
     _option("evaluate", "--focal", "Focal length, pixels", "Of the camera.", defaultValue=1000.0),
     _option("evaluate", "--size", "Side of the image, pixels", "Of a square one.", defaultValue=1000),

@@ -101,7 +101,7 @@ def test_metadata_of_python(tmp_path: Path) -> None:
 
 def model_of(path: Path, inputs: list[tuple], output: tuple) -> Path:
     """A model that gives values of some shape and kind, whatever it takes."""
-    ports = [[helper.make_tensor_value_info(*one) for one in some] for some in (inputs, [output])]
+    ports = [[helper.make_tensor_value_info(*item) for item in some] for some in (inputs, [output])]
     name, kind, shape = output
     constant = numpy_helper.from_array(np.zeros(shape, helper.tensor_dtype_to_np_dtype(kind)))
     return save(helper.make_graph([helper.make_node("Constant", [], [name], value=constant)], "g", *ports), path)
