@@ -68,7 +68,7 @@ def _parts(path: Path) -> list[Path]:
     parts = []
     with os.scandir(folder) as entries:
         for entry in entries:
-            if entry.name.startswith(start) and not entry.is_dir():
+            if entry.name.lower().startswith(start.lower()) and not entry.is_dir():  # disks ignore case
                 try:
                     regular = stat.S_ISREG(entry.stat().st_mode)
                 except OSError:  # a link that leads nowhere

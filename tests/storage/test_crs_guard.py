@@ -135,6 +135,9 @@ def test_a_crs_is_found_however_far_from_the_beginning(tmp_path: Path) -> None:
     path = shapefile(tmp_path, " " * 100_000 + naming("/nowhere/fifo")[6])
     with pytest.raises(RoadgeoError, match="names the file"):
         read_roads(path, which="all")
+    (tmp_path / "roads.prj").rename(tmp_path / "ROADS.Prj")  # found by name on disks that ignore case
+    with pytest.raises(RoadgeoError, match="names the file"):
+        read_roads(path, which="all")
     geopandas.GeoDataFrame(geometry=LINES, crs="EPSG:32629").to_file(tmp_path / "roads.gdb", driver="OpenFileGDB")
     with (tmp_path / "roads.gdb" / "a00000004.gdbtable").open("ab") as table:
         table.write(bytes(100_000) + naming("/nowhere/fifo")[6].encode("utf-16-le"))
