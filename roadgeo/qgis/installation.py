@@ -134,7 +134,7 @@ def _publisher() -> dict[str, str]:
 
 
 def _contents() -> dict[Path, bytes]:
-    """Read the plugin's files, by their paths in its folder; with the table of options, and what `--also` offers."""
+    """Read the plugin's files, by their paths in its folder; with the table of options, and the outputs of `--also`."""
     from roadgeo.cli.table import describe_options
 
     offered = {name: output.summary for name, output in ALSO.items()}

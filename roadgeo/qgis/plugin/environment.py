@@ -19,7 +19,7 @@ __all__ = ["ENVIRONMENT", "SOURCE", "ask_version", "install"]
 #: Where it is made, beside the profiles, which share it.
 ENVIRONMENT = Path(QgsApplication.qgisSettingsDirPath()).parents[1] / "roadgeo"
 
-#: What pip installs: the wheel that came with the plugin, as a package; else the one that pip finds.
+#: The requirement for pip: the wheel that came with the plugin, as a package; else the package that pip finds.
 SOURCE = f"{next(map(str, Path(__file__).parent.glob('roadgeo-*.whl')), 'roadgeo')}[desktop]"
 
 #: A Python has to be new enough, and have venv and pip; it prints its version in any case.

@@ -1,4 +1,4 @@
-"""The window of QGIS: dialogs of algorithms, messages with buttons, and what its map shows."""
+"""The window of QGIS: dialogs of algorithms, messages with buttons, and the extent of its map."""
 
 from __future__ import annotations
 
