@@ -159,6 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
     if arguments is None:  # the process is ours
         gc.set_threshold(_COLLECT_AFTER)
+        os.environ["PYTHONSAFEPATH"] = "1"  # no process of ours imports what lies in the current folder
         if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
             signal.signal(signal.SIGTERM, _terminate)
     skip_drivers()

@@ -71,3 +71,18 @@ def test_no_font_is_needed_but_those_that_come_along(
     assert main(command) == 0
     for name in ("drone_overlay.png", "drone_explain.png"):
         assert (tmp_path / name).stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_further_processes_import_nothing_from_the_current_folder(porto: Path, tmp_path: Path) -> None:
+    here, program = tmp_path / "here", tmp_path / "bin" / "roadgeo"
+    for folder in (here, program.parent):
+        folder.mkdir()
+    program.write_text("if __name__ == '__main__':\n    from roadgeo.cli import main\n\n    raise SystemExit(main())\n")
+    for module in ("multiprocessing", "numba", "signal"):
+        (here / f"{module}.py").write_text("open('ran', 'w').close()\nraise SystemExit(3)\n")
+    masks = [str(DRONE), str(DRONE.with_name("segmenter.png"))]
+    command = [sys.executable, program, "locate", *masks, "-r", str(porto), "--jobs", "2", "-o", "out", "--json"]
+    done = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=300)
+    assert not (here / "ran").exists()
+    assert len(done.stdout.splitlines()) == 2, done.stderr
