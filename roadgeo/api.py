@@ -145,7 +145,7 @@ class Answer(Location):
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.subject import Subject
 
-        if not self.located:
+        if not self.on_map:
             raise NotLocatedError(f"{self.query or 'the mask'} has no place: {self.reason}")
         return Subject(self, self.mask, output_paths(".", "mask"), indexes=self.indexes)
 
@@ -275,6 +275,7 @@ def locate(
     focal: float | Literal["exif"] | None = None,
     effort: Literal["quick", "full"] | None = None,
     time_limit: float | None = None,
+    take: int | None = None,
 ) -> Answer:
     """Find where a photograph, or a mask of roads, lies on a map. Nothing is written.
 
@@ -311,16 +312,22 @@ def locate(
         Whether the search ends early, or roads alone are searched too (the default).
     time_limit : float
         Seconds after which the search stops.
+    take : int
+        Where nothing is located: the place, counted from 1 among `alternatives`, that is the answer; its status is
+        "chosen". The place that an ambiguous answer shows is the first.
 
     Raises
     ------
     MaskError
         The image cannot be read or shows no roads.
+    NotLocatedError
+        There is no such place to take.
     IndexFormatError
         A reference is missing or unusable.
     ValueError
         A hint makes no sense; `near` lies on no map, but would with longitude and latitude exchanged.
     """
+    from roadgeo.running.choosing import choose_place
     from roadgeo.running.looks import Sighting
     from roadgeo.running.pictures import read_picture
     from roadgeo.running.queries import locate_query
@@ -338,13 +345,17 @@ def locate(
         "time_limit": time_limit,
     }
     options = _with_hints(options or LocateOptions(), given, mask)
+    if take is not None:
+        if take < 1:
+            raise ValueError(f"take={take!r}: places are counted from 1")
+        options = replace(options, take=take)
     references = _open(reference)
     meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
     picture = None if isinstance(mask, RoadMask) else read_picture(mask)
     if picture is None:
-        sighting = Sighting(locate_mask(mask, references, options), mask)
+        sighting = Sighting(choose_place(locate_mask(mask, references, options), options), mask)
     else:
         sighting = locate_query(picture, references, options)
     origin = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -39,13 +39,15 @@ __all__ = [
 
 SCHEMA = "roadgeo.location/1"
 
-Status = Literal["located", "ambiguous", "not_located", "error"]
+Status = Literal["located", "ambiguous", "not_located", "chosen", "error"]
 
 
 class Reason(StrEnum):
     """Why a mask was located, or not: a code for programs, beside the sentence for people."""
 
     LOCATED = "located"
+    #: The user took one of the places that a refusal listed.
+    CHOSEN = "chosen"
     #: Two places fit almost equally; or two looks at one scene find two.
     TWO_PLACES = "two_places"
     TWO_LOOKS = "two_looks"
@@ -131,13 +133,23 @@ ERROR_RATES = (
 
 @dataclass(frozen=True)
 class Place:
-    """A point on the map with its odds: the centre of a footprint."""
+    """A point on the map with its odds: the centre of a footprint.
+
+    Attributes
+    ----------
+    footprint_lonlat : tuple of 4 (lon, lat), or None
+        Corners TL, TR, BR, BL of the frame; None where they are not known.
+    frame : Location or None
+        All that follows from this place, where it may be taken (see `LocateOptions.take`).
+    """
 
     x: float
     y: float
     lon: float
     lat: float
     log10_odds: float
+    footprint_lonlat: tuple[tuple[float, float], ...] | None = field(default=None, repr=False)
+    frame: Location | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -274,7 +286,7 @@ class Evidence:
 class Location:
     """Result of locating one mask.
 
-    Everything that needs a place, but the odds, is None unless `status` is "located" or "ambiguous".
+    Everything that needs a place, but the odds, is None unless `status` is "located", "ambiguous" or "chosen".
 
     Attributes
     ----------
@@ -379,6 +391,21 @@ class Location:
     def located(self) -> bool:
         """Whether one place was found."""
         return self.status == "located"
+
+    @property
+    def on_map(self) -> bool:
+        """Whether it is drawn on the map: one place was found, or the user chose one."""
+        return self.status in ("located", "chosen")
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """All places that are known, the best first."""
+        if self.center is None:
+            return self.alternatives
+        ring = (
+            None if self.footprint_lonlat is None else tuple((lon, lat) for lon, lat in self.footprint_lonlat.tolist())
+        )
+        return (replace(self.center, footprint_lonlat=ring, frame=self), *self.alternatives)
 
     @property
     def lonlat_sigma_m(self) -> FloatArray | None:
@@ -496,6 +523,10 @@ class Location:
             middle = {"x": other.x, "y": other.y, "lon": other.lon, "lat": other.lat}
             return {"center": middle, "log10_odds": other.log10_odds}
 
+        def framed(other: Place) -> dict[str, Any]:
+            ring = other.footprint_lonlat
+            return {**place(other), "footprint_lonlat": None if ring is None else [list(corner) for corner in ring]}
+
         center = self.center
         rmse_m, rmse_px = self.rmse() or (None, None)
         # The order in which people read it: the query, the place, its certainty, the cost.
@@ -540,7 +571,7 @@ class Location:
             "log10_odds": self.log10_odds,
             "error_rate": None if self.error_rate is None else self.error_rate._asdict(),
             "runner_up": None if self.runner_up is None else place(self.runner_up),
-            "alternatives": [place(alternative) for alternative in self.alternatives],
+            "alternatives": [framed(alternative) for alternative in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},
             "stats": asdict(self.stats),
             "stopped": self.stopped,

@@ -82,7 +82,7 @@ Examples:
 For each located photo.jpg:
 {always}
 
-Exit status: 0 all located, 3 at least one not located, 1 error, 2 usage.
+Exit status: 0 all located or chosen, 3 at least one not located, 1 error, 2 usage.
 """
 
 _MORE = """Where asked for:
@@ -140,6 +140,9 @@ _OPTIONS = (
     row("--truth", "LON,LAT|FILE", RESULTS,
         "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
         rare=True),
+    row("--take", "N", RESULTS,
+        "Where nothing is located: write the N-th of the places that the refusal lists, as chosen by you.",
+        type=click.IntRange(1), rare=True),
     row("--gcps", "", RESULTS, f"The same as --also gcps: {GCPS.summary}.", rare=True),
     take("crs", "resolution", "resampling", "compression"),
     row("--max-pixels", "N", RESULTS,
@@ -192,7 +195,7 @@ def locate_command(
     from roadgeo.cli.progress import count_up, print_steps, show_steps
 
     options = make_options(hinted(given), method)
-    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
+    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]), take=given["take"])
     outputs = _output_options(given)
     found = find_masks(masks, given["recursive"])
     if not found:
@@ -245,7 +248,7 @@ def locate_command(
         if not quiet:
             echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     failed = counts["error"] or any(outcome.faults for outcome in outcomes)
-    return ERROR if failed else 0 if counts["located"] == len(tasks) else NOT_LOCATED
+    return ERROR if failed else 0 if counts["located"] + counts["chosen"] == len(tasks) else NOT_LOCATED
 
 
 def _output_options(given: Mapping[str, Any]) -> OutputOptions:
@@ -313,7 +316,7 @@ def describe(outcome: Outcome) -> str:
     if outcome.earlier:
         return f"{query}: {words} before"
     status = paint(words, "green" if outcome.status == "located" else "yellow")
-    if outcome.status != "located" or found["center"] is None:
+    if outcome.status not in ("located", "chosen") or found["center"] is None:
         text = f"{query}: {status}: {visible(found['reason'])}"
     else:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
@@ -330,6 +333,8 @@ def describe(outcome: Outcome) -> str:
 def _summarize(counts: Counter[str]) -> str:
     """Print how many masks had which result."""
     parts = [f"{counts['located']} located"]
+    if counts["chosen"]:
+        parts.append(f"{counts['chosen']} chosen")
     if counts["ambiguous"]:
         parts.append(f"{counts['ambiguous']} ambiguous")
     parts.append(f"{counts['not_located']} not located")

@@ -32,11 +32,13 @@ from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
-__all__ = ["Fit", "Found", "search_references"]
+__all__ = ["N_PLACES", "Fit", "Found", "search_references"]
 
 
 #: Work that a first look at coarse maps may take.
 _FIRST_LOOK_S = 0.03
+#: Places that a refusal lists at most.
+N_PLACES = 5
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Found:
     index : ReferenceIndex
         The whole reference.
     fits : tuple of Fit
-        The likeliest place, and the best other one, as far as there are any.
+        The likeliest place, and the best other one, as far as there are any: the answer rests on them.
     stopped : str
         As in `Search`; "" where nothing was searched.
     said : str
@@ -99,6 +101,8 @@ class Found:
     n_searched, n_tried, n_anchors : int
         Intersections of the part of the reference that was searched, places that were screened, and intersections of
         the query that were looked for.
+    further : tuple of Fit
+        Other verified places, the best first: they are shown, no more.
     """
 
     index: ReferenceIndex
@@ -112,6 +116,7 @@ class Found:
     match_s: float = 0.0
     refine_s: float = 0.0
     events: Events = field(default_factory=Events)
+    further: tuple[Fit, ...] = ()
 
 
 def search_references(
@@ -247,11 +252,13 @@ def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], r
     if found.events.kept:
         found.events.result = search
     fits = () if standing is None else _fits(estimator, standing)
+    further = () if standing is None else _further(estimator, standing, N_PLACES - len(fits))
     work_ms = round(1000 * estimator.work / scale)
     counts = estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified
     return replace(
         found,
         fits=fits,
+        further=further,
         stopped=search.stopped,
         n_tried=estimator.n_screened,
         n_anchors=estimator.n_anchors,
@@ -270,6 +277,26 @@ def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
         fits.append(_fit_of_rival(estimator, standing.rival, min(-lead, 0.0), standing.rival_likelihood))
     counted_px = statement_px(sampling(model.matrix, estimator.scene.size))
     return tuple(replace(fit, statement_px=counted_px) for fit in fits if fit is not None)
+
+
+def _further(estimator: TripleEstimator, standing: Standing, most: int) -> tuple[Fit, ...]:
+    """Return the likeliest verified places besides the two that the answer rests on."""
+    likeliest, lead = standing.model, min(-standing.log10_lead, 0.0)
+    known = [likeliest]
+    if standing.rival is not None:
+        known.append(Hypothesis.at(standing.rival, estimator.scene, estimator.index))
+    counted_px = statement_px(sampling(likeliest.matrix, estimator.scene.size))
+    further: list[Fit] = []
+    for model in sorted(estimator.verified, key=lambda model: -model.log10_likelihood):
+        if len(further) == most:
+            break
+        if any(estimator.same(model, other) for other in known):
+            continue
+        known.append(model)
+        fit = _fit(estimator, model, min(model.log10_likelihood - likeliest.log10_likelihood, lead))
+        if fit is not None:  # how far its corners may be off was not measured
+            further.append(replace(fit, corner_sigma_m=None, corner_covariance_m2=None, statement_px=counted_px))
+    return tuple(further)
 
 
 def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | None:

@@ -34,6 +34,8 @@ class LocateOptions:
         city.
     threads : int
         Of the search for one mask. The answer does not depend on it.
+    take : int or None
+        Where nothing is located: the place, counted from 1 among those that the refusal lists, that is the answer.
     """
 
     method: Literal["auto", "pair"] = "auto"
@@ -43,6 +45,7 @@ class LocateOptions:
     min_margin: float = 2.0
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
+    take: int | None = None
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)

@@ -22,7 +22,7 @@ from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import Camera, Evidence, Location, Place, Reason, Seen, Stats
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.evidence import agreement
-from roadgeo.matching.methods import Fit, Found
+from roadgeo.matching.methods import N_PLACES, Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.refinement import corner_sigmas
@@ -74,15 +74,14 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     # The best place of all references, and the others.
     candidates = _pool(query, found)
     best, rivals = (candidates[0] if candidates else None), candidates[1:]
+    places = _list_places(location, query, found, candidates, options)
     if best is not None:
-        others = tuple(_seen_from(best, one) for one in rivals)
-        location = replace(
-            location, log10_odds=best.score, runner_up=others[0] if others else None, alternatives=others
-        )
+        runner_up = places[1] if rivals else None
+        location = replace(location, log10_odds=best.score, runner_up=runner_up, alternatives=places[1:])
     needed = options.min_log10_odds
     rival = None if best is None else _equal(best, rivals, needed)
     if best is None or (best.score < needed and rival is None):
-        return _refuse(location, query, found, best, options)
+        return _refuse(replace(location, alternatives=places), query, found, best, options)
     best = _against(best, rivals)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
@@ -142,16 +141,43 @@ def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
 
     Of places on different references the likelier one is the best.
     """
-    pool = [
-        _Candidate(one, fit, center_of(fit.matrix, query.scene, fit.index.plane, fit.log10_odds))
-        for one in found
-        for fit in one.fits
-    ]
-    distinct: list[_Candidate] = []
+    return _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.fits])
+
+
+def _candidate(query: Query, found: Found, fit: Fit) -> _Candidate:
+    return _Candidate(found, fit, center_of(fit.matrix, query.scene, fit.index.plane, fit.log10_odds))
+
+
+def _distinct(query: Query, pool: Sequence[_Candidate], known: Sequence[_Candidate] = ()) -> list[_Candidate]:
+    """Return the places that are not known, the best first, each once."""
+    distinct = list(known)
     for candidate in sorted(pool, key=lambda one: (-one.fit.explained, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):
             distinct.append(candidate)
-    return distinct
+    return distinct[len(known) :]
+
+
+def _list_places(
+    location: Location,
+    query: Query,
+    found: Sequence[Found],
+    candidates: Sequence[_Candidate],
+    options: LocateOptions,
+) -> tuple[Place, ...]:
+    """List the best places with their footprints: the candidates, then others that were verified.
+
+    All that may be taken are described whole.
+    """
+    further = _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.further], candidates)
+    places = []
+    for number, one in enumerate([*candidates, *further][:N_PLACES], 1):
+        corners = Homography(one.fit.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
+        plane, frame = one.fit.index.plane, None
+        ring = tuple((lon, lat) for lon, lat in to_lonlat(plane.crs, plane.to_crs(corners)).tolist())
+        if options.take is not None and number <= options.take:
+            frame = place_frame(_on(location, one.found), query, one.fit, options.match)
+        places.append(replace(_seen_from(candidates[0], one), footprint_lonlat=ring, frame=frame))
+    return tuple(places)
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
@@ -238,8 +264,6 @@ def _refuse(
     nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
     score = best.score if best is not None else -math.inf
     code, reason = _why_nothing(query, nearest, score, options)
-    if best is not None:  # not reported, but shown
-        location = replace(location, alternatives=(best.center, *location.alternatives))
     location = replace(location, reason_code=code)
     distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
     if len(distinct) == 1:

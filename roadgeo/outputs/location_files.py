@@ -60,7 +60,7 @@ class Written(NamedTuple):
     faults: list[str]
 
 
-def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_camera: bool = True) -> list[Output]:
+def wanted_outputs(names: Iterable[str], on_map: bool, has_photo: bool, has_camera: bool = True) -> list[Output]:
     """Return the outputs of a mask: the usual ones, then those asked for, where their requirements are met.
 
     Raises
@@ -70,7 +70,7 @@ def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_cam
     """
     wanted = [*ALWAYS, *find_outputs(names)]
     wanted = [
-        output for output in wanted if (located or not output.needs_place) and (has_camera or not output.needs_camera)
+        output for output in wanted if (on_map or not output.needs_place) and (has_camera or not output.needs_camera)
     ]
     return [output for output in wanted if not (output is STYLE and has_photo)]
 
@@ -113,7 +113,7 @@ def write_location(
     options = options or OutputOptions()
     photo = None if picture is None else Path(picture)
     subject = Subject(location, mask, paths, options.image, photo, indexes, explanation)
-    wanted = wanted_outputs(options.products, location.located, photo is not None, location.camera is not None)
+    wanted = wanted_outputs(options.products, location.on_map, photo is not None, location.camera is not None)
     targets = {output: paths.of(output, subject.picture.name) for output in wanted}
     try:
         with ExitStack() as files:
@@ -167,7 +167,7 @@ def write_json(path: Path, subject: Subject) -> None:
 def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) -> list[Path]:
     """List outdated files of an earlier run, which show a place or a camera."""
     outputs = dict.fromkeys([*REGISTRY.values(), *find_outputs(names)])
-    if subject.location.located:
+    if subject.location.on_map:
         outputs = dict.fromkeys(output for output in outputs if output.needs_camera and subject.location.camera is None)
     return [subject.paths.of(output, subject.picture.name) for output in outputs if output not in written]
 

@@ -21,6 +21,8 @@ from roadgeo.storage.qml import draw_fill
 __all__ = ["write_summary"]
 
 _FRAME = ",".join(map(str, rgb("frame")))
+#: Statuses of masks whose footprints are shown.
+_ON_MAP = ("located", "chosen")
 _STYLE = draw_fill(f"{_FRAME},40", _FRAME, 0.5)
 
 
@@ -46,8 +48,8 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
         {**document, "query": name, "reason": attributes(document)["reason"]}
         for document, name in zip(documents, names, strict=True)
     ]
-    located = [document for document in documents if document["status"] == "located"]
-    others = [document for document in documents if document["status"] != "located"]
+    located = [document for document in documents if document["status"] in _ON_MAP]
+    others = [document for document in documents if document["status"] not in _ON_MAP]
     parts = [cut_ring(np.array(document["footprint_lonlat"], float)) for document in located]
     shapes: tuple[GeometryType, list[Any]] = ("POLYGON", [rings[0] for rings in parts])
     if any(len(rings) > 1 for rings in parts):
@@ -69,7 +71,7 @@ def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*WORDS, "lon", "lat", "crs", "x", "y", *NUMBERS, "footprint_wkt"])
     for document in documents:
-        here = document if document["status"] == "located" else {}
+        here = document if document["status"] in _ON_MAP else {}
         center = here.get("center") or {}
         position = [center.get("lon"), center.get("lat"), here.get("crs"), center.get("x"), center.get("y")]
         values = {**attributes(document), "query": document["query"]}

@@ -53,7 +53,7 @@ def read_location(path: str | os.PathLike[str]) -> Location:
         raise MaskError(
             f"{name}: no location ({error}); give the *_location.json that `roadgeo locate` wrote"
         ) from error
-    if location is None or not location.located:
+    if location is None or not location.on_map:
         raise NotLocatedError(f"{name}: {document.get('query')} has no sure place: {document.get('reason')}")
     return location
 

@@ -260,9 +260,11 @@ class Locating:
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.query):
             return None
         status, photo = document.get("status"), self.options.photo(task, is_ours(probability_path(paths)))
-        if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
+        if status not in {"located", "ambiguous", "not_located", "chosen"} or not asked.same(document):
             return None
-        wanted = wanted_outputs(self.outputs.products, status == "located", bool(photo), bool(document.get("camera")))
+        wanted = wanted_outputs(
+            self.outputs.products, status in ("located", "chosen"), bool(photo), bool(document.get("camera"))
+        )
         files = [paths.of(output, Path(photo or task.mask).name) for output in wanted]
         whole = all(path.is_file() and path.stat().st_size for path in files)
         return Outcome(status, document, earlier=True) if whole else None
@@ -303,7 +305,7 @@ class Locating:
             written.location.to_dict(),
             tuple(map(str, (*written.files, *kept))),
             tuple(map(str, written.removed)),
-            (photo, _scale(photo, mask)) if photo and location.located else None,
+            (photo, _scale(photo, mask)) if photo and location.on_map else None,
             faults=tuple(written.faults),
         )
 

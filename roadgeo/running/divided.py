@@ -204,7 +204,10 @@ class _Searcher:
 
 
 def _less_likely(found: Found, against: float) -> Found:
-    return replace(found, fits=tuple(replace(fit, log10_odds=fit.log10_odds - against) for fit in found.fits))
+    fits, further = (
+        tuple(replace(fit, log10_odds=fit.log10_odds - against) for fit in some) for some in (found.fits, found.further)
+    )
+    return replace(found, fits=fits, further=further)
 
 
 def _path(part: Any) -> str:

@@ -142,7 +142,7 @@ def _refused(location: Location, reason: str) -> Location:
         location.reference,
         location.attribution,
         reason_code=Reason.TOO_MANY_LOOKS,
-        alternatives=tuple(filter(None, (location.center, *location.alternatives))),
+        alternatives=location.places,
     )
     kept = ("size", "n_intersections", "seconds", "stats", "stopped", "seen")
     seen = {name: getattr(location, name) for name in kept}
@@ -165,7 +165,7 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
         lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
         if lead < options.min_margin:
             reason = "seen in two ways it fits at two places, almost equally"
-            others = () if rival.center is None else (rival.center, *location.alternatives)
+            others = (*rival.places[:1], *location.alternatives)
             location = replace(
                 location,
                 status="ambiguous",

@@ -15,6 +15,7 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
+from roadgeo.running.choosing import choose_place
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, only_plugin, open_frame
@@ -51,8 +52,22 @@ def locate_query(
         There is no model, or it cannot be run.
     PluginError
         A segmenter fails.
+    NotLocatedError
+        A place is to be taken that the answer does not list.
     """
     options, reading = options or LocateOptions(), reading or ReadOptions()
+    sighting = _look_for(path, references, options, reading, how, say)
+    return replace(sighting, location=choose_place(sighting.location, options))
+
+
+def _look_for(
+    path: str | AnyArray,
+    references: Sequence[AnyReference],
+    options: LocateOptions,
+    reading: ReadOptions,
+    how: Locate,
+    say: Say,
+) -> Sighting:
     if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
         return _locate_lines(path, references, options, reading, how)
     if not reading.fused_with:

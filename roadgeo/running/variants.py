@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -83,10 +83,19 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
     side = math.sqrt(abs(float(np.linalg.det(matrix))))  # pixels of the variant for each of the query, along a side
     back = Homography(PIXEL_TO_PLANE @ Homography(matrix).inverse().matrix @ PIXEL_TO_PLANE)
     camera, homography, seen, evidence = location.camera, location.homography, location.seen, location.evidence
+    order = _order_of_corners(location.size, size, matrix)
     changed: dict[str, Any] = {"size": size}
+    changed["alternatives"] = tuple(
+        replace(
+            place,
+            footprint_lonlat=place.footprint_lonlat and tuple(place.footprint_lonlat[k] for k in order.tolist()),
+            frame=place.frame and in_pixels_of(place.frame, size, matrix),
+        )
+        for place in location.alternatives
+    )
     if homography is not None:
         homography = homography @ matrix
-        changed.update(homography=homography / homography[2, 2], **_corners_of(location, size, matrix))
+        changed.update(homography=homography / homography[2, 2], **_corners_of(location, order))
     if location.gsd_m is not None:
         changed["gsd_m"] = location.gsd_m * side
     if camera is not None:
@@ -101,11 +110,14 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
     return replace(location, **changed)
 
 
-def _corners_of(location: Location, size: tuple[int, int], matrix: FloatArray) -> dict[str, Any]:
-    """Return what is known of a variant's corners in the order of the query's."""
+def _order_of_corners(theirs: tuple[int, int], size: tuple[int, int], matrix: FloatArray) -> IntArray:
+    """Return which corner of a variant of (width, height) each corner (4,) of the query is."""
     corners = Homography(matrix)(Frame(*size).corners)
-    theirs = Frame(*(location.size or size)).corners
-    order = np.hypot(*(corners[:, None] - theirs[None]).transpose(2, 0, 1)).argmin(axis=1)
+    return np.asarray(np.hypot(*(corners[:, None] - Frame(*theirs).corners[None]).transpose(2, 0, 1)).argmin(axis=1))
+
+
+def _corners_of(location: Location, order: IntArray) -> dict[str, Any]:
+    """Return what is known of a variant's corners in the order of the query's."""
     pairs = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
     covariance = location.corner_covariance_m2
     found = {name: getattr(location, name) for name in ("footprint", "footprint_lonlat", "corner_sigma_m")}

@@ -200,11 +200,11 @@ class Service:
         """List the files that may be had of an answer; their addresses start at the page's."""
         job = self._find(request)
         document = job.answer.document if job.answer is not None and job.status == "successful" else {}
-        located, camera = document.get("status") == "located", document.get("camera") is not None
+        on_map, camera = document.get("status") in ("located", "chosen"), document.get("camera") is not None
         offered = [
             {"name": output.name, "summary": output.summary, "href": f"jobs/{job.id}/files/{output.name}"}
             for output in OFFERED.values()
-            if document and (located or not output.needs_place) and (camera or not output.needs_camera)
+            if document and (on_map or not output.needs_place) and (camera or not output.needs_camera)
         ]
         return JSONResponse({"files": offered})
 

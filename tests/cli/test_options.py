@@ -102,7 +102,7 @@ def test_every_hint_is_an_option_of_locate_a_parameter_over_http_and_a_keyword_o
     options = {name for param in command("locate").params for name in param.opts}
     assert {hint.option for hint in HINTS.values()} <= options
     keywords = inspect.signature(roadgeo.locate).parameters
-    assert {name for name, keyword in keywords.items() if keyword.kind is keyword.KEYWORD_ONLY} == set(HINTS)
+    assert {name for name, keyword in keywords.items() if keyword.kind is keyword.KEYWORD_ONLY} - {"take"} == set(HINTS)
     assert all(f"  {hint.parameter}=" in shown("serve", "--help-all") for hint in HINTS.values())
 
 

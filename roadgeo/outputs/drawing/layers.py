@@ -91,7 +91,7 @@ LOOKS = {
     "streets": Look("ink", 0.8),
     "way": Look("ink", 1.6, dash="5 3"),
     **{name: Look("good", 2.0, fill=0.15) for name in ("located", "right")},
-    **{name: Look("fair", 2.0, fill=0.15) for name in ("ambiguous", "predicted")},
+    **{name: Look("fair", 2.0, fill=0.15) for name in ("ambiguous", "chosen", "predicted")},
     **{name: Look("bad", 2.0, fill=0.15) for name in ("wrong", "lost")},
     "tracked": Look("frame", 2.0, fill=0.15),
     "not_located": Look("faint", 2.0, fill=0.15),

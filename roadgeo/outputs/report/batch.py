@@ -111,7 +111,7 @@ def _draw_map(index: ReferenceIndex, entries: Sequence[Entry]) -> str:
     """Draw a whole map with the footprints that lie on it, each a link."""
     picture, window = whole_map(index, _OVERVIEW_BYTES, 2 * _VIEW_PX)
     layers = [picture]
-    for status in ("ambiguous", "located"):
+    for status in ("ambiguous", "chosen", "located"):
         there = [entry for entry in entries if entry.status == status and _has_place(entry)]
         rings = [
             Ring(window.place(np.array(entry.document["footprint"], float)), title=entry.path.name, link=entry.link)
@@ -127,7 +127,7 @@ def _item(entry: Entry, with_folder: bool) -> str:
     document = entry.document
     center, sigma, odds = document.get("center"), document.get("corner_sigma_m"), document.get("log10_odds")
     parts = []
-    if entry.status == "located" and center:
+    if entry.status in ("located", "chosen") and center:
         parts.append(format_lonlat(center["lon"], center["lat"]))
         if sigma:
             parts.append(f"corners {write_sigma(max(sigma))}")

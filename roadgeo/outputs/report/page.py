@@ -19,6 +19,7 @@ from roadgeo import __version__
 from roadgeo._text import counted
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
+from roadgeo.geometry.projection import transform
 from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import Cross, Layer, Ring
@@ -41,10 +42,19 @@ from roadgeo.outputs.wording import format_lonlat, write_distance, write_lead, w
 __all__ = ["STATUS", "footer", "render_page", "render_report", "section", "table", "write_report"]
 
 #: How each status is shown: by a sign and a word, not by colour alone.
-STATUS = {"located": "✓ located", "ambiguous": "≈ ambiguous", "not_located": "✕ not located", "error": "! failed"}
+STATUS = {
+    "located": "✓ located",
+    "ambiguous": "≈ ambiguous",
+    "chosen": "☞ chosen",
+    "not_located": "✕ not located",
+    "error": "! failed",
+}
 
 _CORNERS = ("top left", "top right", "bottom right", "bottom left")
 _WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+#: How the user overrules a refusal.
+_TAKING = "If you know one of the places to be right, the same command with --take N writes the N-th."
 
 #: Below this number of intersections a report recommends a larger frame.
 _FEW = 12
@@ -196,10 +206,14 @@ def _draw_overview(subject: Shown) -> str:
     layers = [picture]
     if subject.place is not None:
         layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
-    other = subject.runner_up()
-    if other is not None:
-        called = "runner-up" if subject.place else "best"
-        layers.append(Layer("runner-up", "", [Cross(window.place(other), called)]))
+    known = [place.footprint_lonlat for place in location.alternatives if place.footprint_lonlat is not None]
+    grounds = [transform("EPSG:4326", index.plane.crs, np.array(ring)) for ring in known]
+    others: list[Cross | Ring] = [Ring(window.place(ground)) for ground in grounds if np.isfinite(ground).all()]
+    middle = subject.runner_up()
+    if middle is not None:
+        others.append(Cross(window.place(middle), "runner-up" if subject.place else "best"))
+    if others:
+        layers.append(Layer("runner-up", "", others))
     text = f"All of the map {index.name}" + (", with the footprint" if subject.place else "")
     box = " ".join(f"{value:.0f}" for value in window.box)
     return (
@@ -218,6 +232,10 @@ def _explain(subject: Shown) -> str:
     location = subject.location
     if location.status == "located":
         texts = [_rival(location)]
+    elif location.status == "chosen":
+        texts = [
+            "Nothing stands out here: this is a place that you chose. How often such places are wrong is not known."
+        ]
     elif location.reason_code is Reason.HALF_A_PLACE:
         texts = [
             "The place is known in one direction only. Nothing was georeferenced; shown is the likeliest.",
@@ -228,6 +246,7 @@ def _explain(subject: Shown) -> str:
             "Two places fit, and which one is right cannot be told. Nothing was georeferenced; shown is the better.",
             _rival(location),
             f"A {subject.subject} of more ground, or a hint (--near, --gsd, --north-up), may decide between them.",
+            _TAKING,
         ]
     else:
         texts = _advice(subject)
@@ -237,16 +256,25 @@ def _explain(subject: Shown) -> str:
 def _advice(subject: Shown) -> list[str]:
     """Return what to look at where nothing was found: HTML."""
     location, called = subject.location, subject.subject
-    n, best = location.n_intersections, next(iter(location.alternatives), None)
+    n, places = location.n_intersections, location.alternatives
     few = f": few. {_FEW} or more, of more ground, would help" if n < _FEW else ""
     return [
         "Nothing was georeferenced. What to look at:",
-        f"The best place that it had, though not sure enough: {_link(best)}" if best else "",
+        _listed(places),
         f"{counted(n, 'intersection')} {'is' if n == 1 else 'are'} seen in the {called}{few}.",
         f"Do the coloured lines follow its roads? If not, a cleaner {called}, --threshold or --band may help.",
         f"Was the right map searched? It was {html.escape(location.reference)}.",
         f"Whatever is known shortens the search and may save a {called}: --near, --gsd, --north-up, --max-tilt.",
     ]
+
+
+def _listed(places: Sequence[Place]) -> str:
+    """List the best places of a refusal with their scores: HTML."""
+    if not places:
+        return ""
+    scores = [min(place.log10_odds, places[0].log10_odds) for place in places]
+    lines = [f"{n}. {_link(places[n - 1])} <small>score {score:.1f}</small>" for n, score in enumerate(scores, 1)]
+    return "<br>".join(["The best places that it had, though not sure enough:", *lines, _TAKING])
 
 
 def _rival(location: Location) -> str:

@@ -286,7 +286,7 @@ def _locate(mask: str, picture: str, options: list[str], values: Values, session
         results["REPORT_PAGE"] = str(page)
     points_there, page_there = (str(path) if path.exists() else "" for path in (points, page))
     session.finding = Finding(name, picture, points_there, page_there, location, values.parameters)
-    if location["status"] != "located":
+    if location["status"] not in ("located", "chosen"):
         for name_of_map in {place.map for place in list_places(location)} - {""}:
             session.show_map(name_of_map)
         session.feedback.pushWarning(f"{name}: {location['reason']}")

@@ -33,9 +33,10 @@ def announce_ready(version: str) -> None:
 def announce(algorithm: str, finding: Finding) -> None:
     """Report a result in the window's message bar, with buttons for the next step."""
     location, offered = finding.location, {}
-    located = location["status"] == "located"
+    located = location["status"] in ("located", "chosen")
     if located:
-        text = f"located, {location['gsd_m']:.2g} m per pixel, up is {location['rotation_deg'] % 360.0:.0f}° from north"
+        up_deg = location["rotation_deg"] % 360.0
+        text = f"{location['status']}, {location['gsd_m']:.2g} m per pixel, up is {up_deg:.0f}° from north"
     else:
         chosen = finding.parameters.get("NEAR")
         text = f"{'not sure near the chosen place either: ' if chosen else ''}{location['reason']}"

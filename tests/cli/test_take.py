@@ -1,0 +1,101 @@
+"""A refusal lists the best places, and `--take N` writes the N-th as one that the user chose."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import roadgeo
+from roadgeo.cli import main
+from roadgeo.errors import NotLocatedError
+from roadgeo.evaluation import scoring
+from roadgeo.evaluation.demo import demo_masks
+from roadgeo.evaluation.truth import Truth
+
+MASKS = {mask.path.stem: str(mask.path) for mask in demo_masks()}
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def refused(porto: Path) -> roadgeo.Location:
+    """The demonstration's mask of another city."""
+    return roadgeo.locate(MASKS["elsewhere"], str(porto))
+
+
+def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused):
+    places = refused.to_dict()["alternatives"]
+    assert (refused.status, refused.center) == ("not_located", None)
+    assert 1 < len(places) <= 5
+    scores = [place["log10_odds"] for place in places]
+    assert scores[1:] == sorted(scores[1:], reverse=True)
+    assert scores[0] == refused.log10_odds
+    middles = np.array([[place["center"]["x"], place["center"]["y"]] for place in places])
+    apart = np.hypot(*(middles[:, None] - middles[None]).transpose(2, 0, 1))
+    assert apart[np.triu_indices(len(places), 1)].min() > 50.0
+    for place in places:
+        corners = np.array(place["footprint_lonlat"])
+        assert corners.shape == (4, 2)
+        assert np.abs(corners.mean(axis=0) - (place["center"]["lon"], place["center"]["lat"])).max() < 0.02
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd):
+    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", str(n), "--report"]) == 0
+    assert "elsewhere.png: chosen at" in capfd.readouterr().out
+    written = {path.name for path in Path().iterdir()}
+    assert {"elsewhere_footprint.tif", "elsewhere_location.gpkg", "elsewhere_report.html"} <= written
+    found, listed = json.loads(Path("elsewhere_location.json").read_text()), refused.alternatives
+    assert (found["status"], found["reason_code"], found["error_rate"]) == ("chosen", "chosen", None)
+    score = min(listed[n - 1].log10_odds, listed[0].log10_odds)
+    assert found["log10_odds"] == pytest.approx(score)
+    assert found["reason"] == (f"chosen by you: place {n} of {len(listed)}; the score is {score:.1f}, 3.5 is asked for")
+    off = np.array(found["footprint_lonlat"]) - listed[n - 1].footprint_lonlat
+    assert np.abs(off).max() < 0.001
+    others = [place["center"]["lon"] for place in found["alternatives"]]
+    assert others == [place.lon for place in listed if place is not listed[n - 1]]
+    assert found["command"].count("--take") == 1
+
+
+def test_a_place_that_is_not_listed_cannot_be_taken(porto, refused, capfd):
+    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", "9"]) == 1
+    err = capfd.readouterr().err
+    assert f"there is no place 9: {len(refused.alternatives)} are listed" in err
+    assert len(err.strip().splitlines()) == 1
+    assert not list(Path().glob("*_footprint.tif"))
+    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", "0"]) == 2
+
+
+def test_a_located_mask_stays_located(porto):
+    usual, taken = (roadgeo.locate(MASKS["drone"], str(porto), take=take) for take in (None, 1))
+    assert (taken.status, taken.reason) == ("located", usual.reason)
+    assert taken.center == usual.center
+
+
+def test_python_takes_a_place_too(porto, refused):
+    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), take=2)
+    assert (taken.status, taken.located, taken.error_rate) == ("chosen", False, None)
+    assert taken.to_xarray().shape
+    with pytest.raises(NotLocatedError, match="there is no place 9"):
+        roadgeo.locate(MASKS["elsewhere"], str(porto), take=9)
+    with pytest.raises(ValueError, match="take"):
+        roadgeo.locate(MASKS["elsewhere"], str(porto), take=0)
+
+
+def test_a_chosen_place_does_not_count_as_located(porto):
+    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), take=1)
+    truth = Truth("elsewhere.png", "no place", taken.homography, taken.crs, taken.size, on_map=False)
+    assert not scoring.score(truth, taken.to_dict()).located
+
+
+def test_the_report_of_a_refusal_names_the_places_and_the_option(porto, refused):
+    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--report"]) == 3
+    page = Path("elsewhere_report.html").read_text()
+    assert "--take N" in page
+    for place in refused.alternatives:
+        assert f"{place.lat:.5f}" in page
