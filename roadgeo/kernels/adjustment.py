@@ -430,8 +430,8 @@ def adjust(
     n : int
         Road points that took part; -1 where the adjustment failed.
     rms : float
-        Scale of their residuals, metres: its square times the inverse of `normal` is the covariance of an M-estimate
-        (Huber 1981, 7.6), which a merely weighted rms would claim too small. inf where it failed or there are none.
+        Scale of their residuals, metres, inf where the adjustment failed or no point took part. Its square times the
+        inverse of `normal` is the covariance of an M-estimate (Huber 1981, 7.6); a weighted rms would be too small.
     """
     n = normal.shape[0]
     system = _System(normal, np.empty(n), np.zeros((n, n)), np.empty(n))

@@ -51,7 +51,7 @@ Kind: TypeAlias = ArrayKind | TupleKind | type[float] | type[int] | type[bool] |
 
 
 def kind_of(annotation: Any, written: bool = False) -> Kind:
-    """Return what an annotation means to a kernel, which writes to the arrays in it or only reads them.
+    """Return the kind of value that an annotation describes; `written` marks arrays that the kernel writes to.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def kind_of(annotation: Any, written: bool = False) -> Kind:
         return annotation  # type: ignore[no-any-return]
     if get_origin(annotation) is Annotated:
         array, ndim = get_args(annotation)
-        told = get_args(array)  # of the alias `NDArray[scalar]`, or, before NumPy made it one, of its expansion
-        return ArrayKind(np.dtype(told[0] if len(told) == 1 else get_args(told[1])[0]), ndim, written)
+        given = get_args(array)  # from the alias `NDArray[scalar]`, or from its expansion in older NumPy
+        return ArrayKind(np.dtype(given[0] if len(given) == 1 else get_args(given[1])[0]), ndim, written)
     if get_origin(annotation) is tuple:
         return TupleKind(tuple(kind_of(member, written) for member in get_args(annotation)))
     if hasattr(annotation, "_fields"):

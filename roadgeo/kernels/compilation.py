@@ -45,23 +45,23 @@ _LOG = logging.getLogger(__name__)
 #: The newest numba whose private parts `machine_code` was tried with; kernels of later ones are left to numba whole.
 _NEWEST_NUMBA = (0, 68)
 
-#: Of kernels that match: divisions are not looked at for a zero, may become products, and products with sums one
-#: instruction. That is a tenth quicker. Kernels that draw a map compute as they are written, for it must be the same on
-#: every machine.
+#: Options for kernels that match, a tenth quicker: no check for division by zero, divisions may become products, and a
+#: product with a sum may become a single instruction. Kernels that draw a map compute as they are written: the map must
+#: be the same on every machine.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
 
 _lock = threading.RLock()
 
 
 def kernel(*, writes: tuple[str, ...] = (), **options: Any) -> Callable[[_Function], _Function]:
-    """Make a kernel of a function; `options` are those of numba's `njit`.
+    """Make a function a kernel; `options` go to numba's `njit`.
 
-    A kernel that is called from Python names the arguments whose arrays it `writes` to. Numba refuses to compile one
-    that writes to others; arrays that are read-only, which may lie in a file, are refused when it is called.
+    A kernel that is called from Python names the arguments whose arrays it `writes` to. Numba refuses to compile a
+    kernel that writes to other arrays. A call refuses read-only arrays, which may lie in a file, for these arguments.
 
-    What runs in the inner loops takes the arrays that it needs, not NamedTuples of many: a call counts references to
-    all members, which made growth take 1.7 times as long. Stages that are called once are inlined (`forceinline`), so
-    that a kernel is as quick in parts as in one piece.
+    Functions in inner loops take the arrays that they need, not NamedTuples of many: a call counts references to all
+    members, and growth took 1.7 times as long. Stages that are called once are inlined (`forceinline`): a kernel in
+    parts is then as quick as in one piece.
     """
 
     def decorate(function: _Function) -> _Function:
@@ -149,13 +149,13 @@ class _Call:
     Arrays of other types, or not contiguous, are left to numba.
     """
 
-    def __init__(self, one: Kernel, code: Any, release: Callable[[int], None]) -> None:
-        self.code, self.release, self.kernel = code, release, one
-        self.name, self.arguments, self.result = one.name, one.arguments or (), one.result
+    def __init__(self, kernel: Kernel, code: Any, release: Callable[[int], None]) -> None:
+        self.code, self.release, self.kernel = code, release, kernel
+        self.name, self.arguments, self.result = kernel.name, kernel.arguments or (), kernel.result
         given = ("d" if leaf is float else "q" for leaf in leaves(*self.arguments))
         returned = (
             f"QQ{leaf.ndim}q" if isinstance(leaf, ArrayKind) else ("d" if leaf is float else "q")
-            for leaf in leaves(one.result)
+            for leaf in leaves(kernel.result)
         )
         self.pack = struct.Struct("=" + "".join(given)).pack
         self.answer = struct.Struct("=" + "".join(returned))
@@ -183,7 +183,7 @@ class _Call:
 
 
 def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...], name: str) -> bool:
-    """Add the machine words of a value; False: an array is not what it expects."""
+    """Add the machine words of the values; return False at an array of another type, or one that is not contiguous."""
     for value, kind in zip(values, kinds, strict=True):
         if type(kind) is ArrayKind:
             if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
@@ -214,8 +214,8 @@ def _kinds(function: Callable[..., Any], writes: tuple[str, ...]) -> tuple[tuple
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
 
-#: Modules whose kernels every search needs: those that draw masks and maps, and those that match them. Those of the
-#: paper's method are compiled when it is asked for.
+#: Modules whose kernels every search needs: the first draw masks and maps, the second match them. The kernels of the
+#: paper's method are compiled on its first use.
 _DRAWING = ("simplification", "parallel_roads", "thinning", "tracing", "intersections", "buckets", "triple_codes")
 _MATCHING = (
     "roads",
@@ -270,7 +270,7 @@ def _engine() -> _Engine:
 def kernel_folder() -> Path:
     """Return the folder of the kernels' machine code, a temporary one where the user's cache folder cannot be written.
 
-    It is named after all that the code depends on. Its files are executed, so nobody else may write to it.
+    Its name depends on everything that the code depends on. Its files are executed, so nobody else may write to it.
     """
     python = f"{platform.python_version()}{getattr(sys, 'abiflags', '')} {sys.implementation.cache_tag}"
     known = (__version__, _engine().name, platform.machine(), python, np.__version__, _numba_version())
@@ -290,8 +290,8 @@ def _numba_version() -> str:
     spec = importlib.util.find_spec("numba")
     with contextlib.suppress(OSError):
         source = Path(getattr(spec, "origin", None) or "").with_name("_version.py").read_text("utf-8")
-        if told := re.search(r'"version": "([^"]+)"', source):
-            return told[1]
+        if found := re.search(r'"version": "([^"]+)"', source):
+            return found[1]
     from importlib.metadata import version
 
     return version("numba")
@@ -303,7 +303,7 @@ def compiled(modules: Sequence[str] | None = None) -> bool:
 
 
 def load(modules: Sequence[str] | None = None, progress: Progress | None = None) -> None:
-    """Load the machine code of modules (of the search), after compiling what is not there."""
+    """Load the machine code of modules (by default the search's); compile it first where the folder lacks it."""
     with _lock:
         wanted = [m for m in modules or modules_of_the_search() if m not in _left_to_numba]
         missing = [m for m in wanted if not _load(m)]
@@ -349,7 +349,7 @@ def _require_known_numba() -> None:
 
 
 def _load(module: str) -> bool:
-    """Load a module's machine code; False: there is none, or it is damaged."""
+    """Load a module's machine code; return False where it is missing or damaged."""
     if all(k._run is not None for k in entries(module)):
         return True
     try:
@@ -371,6 +371,6 @@ def _bind(module: str, code: bytes) -> None:
     _kept_alive.append(engine)
     release = ctypes.PYFUNCTYPE(None, ctypes.c_uint64)(engine.get_function_address("roadgeo_release"))
     # Other threads run meanwhile (`matching.ahead`): none of them writes to arrays that a kernel was given.
-    for one in entries(module):
-        address = engine.get_function_address(f"roadgeo_{one.name}")
-        one.bind(ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_char_p, ctypes.c_void_p)(address), release)
+    for entry in entries(module):
+        address = engine.get_function_address(f"roadgeo_{entry.name}")
+        entry.bind(ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_char_p, ctypes.c_void_p)(address), release)

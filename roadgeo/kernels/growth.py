@@ -1,6 +1,6 @@
 """Growth of a hypothesis: from a few matched intersections outwards over the whole query.
 
-The parameters p of the model are those of `kernels.adjustment`, without a lens, around the anchor: query
+The model has the parameters p of `kernels.adjustment`, without a lens, around the anchor: it maps query
 (x - xa) / half_size to reference (X - XA) / unit.
 """
 
@@ -108,7 +108,7 @@ def _place_seeds(
     n_seeds = 1
     for s in range(query.neighbours.shape[1]):
         if partners[s] >= 0:
-            i = int(np.int64(query.neighbours[query.anchor, s]))  # of one type everywhere, `_match` is compiled once
+            i = int(np.int64(query.neighbours[query.anchor, s]))  # the same type everywhere: `_match` is compiled once
             _match(growth, i, partners[s], points, matched)
             growth.seed[i] = True
             n_seeds += 1
@@ -117,7 +117,7 @@ def _place_seeds(
 
 @kernel()
 def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
-    """Take one step of least squares to all that is matched; return whether that worked."""
+    """Take one least-squares step to all matches; return whether it worked."""
     query, image, p, normal, right, row = (
         growth.query, growth.image, growth.p, growth.normal, growth.right, growth.row,
     )  # fmt: skip
@@ -144,8 +144,8 @@ def _predict_radius(
 ) -> tuple[float, float, float, float]:
     """Return where a query point is predicted, its w, and its search radius in metres: -1 at the horizon.
 
-    Its variance is that of x and y together, in units of the residuals' variance: with J (2, 8) the derivative of the
-    point by p, and L L^T the normal matrix, the trace of J (L L^T)^-1 J^T.
+    The radius follows from the summed variance of x and y, in units of the residuals' variance: the trace of
+    J (L L^T)^-1 J^T, where J (2, 8) is the derivative of the point by p, and L L^T the normal matrix.
     """
     x, y, w = point_row(p, u, v, (0.0, 0.0), 1.0, 0.0, row)
     variance = spread(row, factor, work)
@@ -286,10 +286,10 @@ def grow(
 ) -> tuple[int, int, float]:
     """Grow a hypothesis from its seeds, give up early or match the whole query.
 
-    Seeds are the anchor and its placed neighbours. Each further point is predicted, the nearest ones first, once its
-    search radius, 2.5 of the prediction's own standard deviations, has come down to the greatest one; matches refit the
-    model. A sequential probability ratio test (Wald 1945) counts hits and misses and gives up below -`patience`. In the
-    end all in `query.order` are matched anew, one to one, twice.
+    Seeds are the anchor and its placed neighbours. Each further point is predicted, the nearest first, once its search
+    radius, 2.5 standard deviations of the prediction, no longer exceeds the largest radius. Matches refit the model. A
+    sequential probability ratio test (Wald 1945) counts hits and misses and gives up below -`patience`. At the end all
+    points in `query.order` are matched anew, one to one, twice.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ __all__ = ["CannotKeep", "compile_kernels"]
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _POINTER = ir.IntType(8).as_pointer()
-#: Where numpy's array objects hold the address of their data and that of their shape (`PyArrayObject_fields`).
+#: Offsets in numpy's array objects of the addresses of their data and of their shape (`PyArrayObject_fields`), bytes.
 _DATA, _SHAPE = 16, 32
 #: Functions of C's library, which is in every process; with an f behind for float32.
 _C = {"malloc", "free", "memset", "memcpy", "memmove"}
@@ -49,14 +49,14 @@ def compile_kernels(kernels: Sequence[Kernel], llvm: Any, machine: Any, progress
         raise CannotKeep("numpy's arrays")
     whole = llvm.parse_assembly(str(_runtime()))
     progress(0)
-    for n, one in enumerate(kernels, 1):
-        argument_types = tuple(map(_numba_type, one.arguments or ()))
-        one.part.compile(argument_types)
-        made = one.part.overloads[argument_types]
-        if made.signature.return_type != _numba_type(one.result):
-            raise TypeError(f"kernel {one.name} returns {made.signature.return_type}, not what it is annotated with")
+    for n, kernel in enumerate(kernels, 1):
+        argument_types = tuple(map(_numba_type, kernel.arguments or ()))
+        kernel.part.compile(argument_types)
+        made = kernel.part.overloads[argument_types]
+        if made.signature.return_type != _numba_type(kernel.result):
+            raise TypeError(f"kernel {kernel.name} returns {made.signature.return_type}, not what it is annotated with")
         whole.link_in(llvm.parse_assembly(made.library.get_llvm_str()))
-        whole.link_in(llvm.parse_assembly(str(_entry(one, made.fndesc))))
+        whole.link_in(llvm.parse_assembly(str(_entry(kernel, made.fndesc))))
         progress(n)
     needed = {f.name for f in whole.functions if f.is_declaration and not f.name.startswith("llvm.")}
     if not needed <= _IN_EVERY_PROCESS:
@@ -83,22 +83,22 @@ def _numba_type(kind: Kind) -> Any:
     return {float: types.float64, int: types.int64, bool: types.boolean, None: types.none}[kind]
 
 
-def _entry(one: Kernel, made: Any) -> ir.Module:
+def _entry(kernel: Kernel, made: Any) -> ir.Module:
     """Write the entry that calls a compiled kernel."""
     context = cpu_target.target_context
-    module = context.create_module(f"roadgeo.{one.name}")
+    module = context.create_module(f"roadgeo.{kernel.name}")
     kernel_type = context.call_conv.get_function_type(made.restype, made.argtypes)
     callee = ir.Function(module, kernel_type, made.llvm_func_name)
     slots = _I64.as_pointer()
-    entry = ir.Function(module, ir.FunctionType(_I32, [slots, slots]), f"roadgeo_{one.name}")
+    entry = ir.Function(module, ir.FunctionType(_I32, [slots, slots]), f"roadgeo_{kernel.name}")
     builder = ir.IRBuilder(entry.append_basic_block())
     given, answer = entry.args
     numbers = (builder.load(builder.gep(given, [_I64(n)])) for n in range(1 << 20))
-    values = [_argument(context, builder, kind, numbers) for kind in one.arguments or ()]
+    values = [_argument(context, builder, kind, numbers) for kind in kernel.arguments or ()]
     status, value = context.call_conv.call_function(builder, callee, made.restype, made.argtypes, values)
     with builder.if_then(status.is_error):
         builder.ret(_I32(1))
-    for n, number in enumerate(_results(context, builder, one.result, value)):
+    for n, number in enumerate(_results(context, builder, kernel.result, value)):
         builder.store(number, builder.gep(answer, [_I64(n)]))
     builder.ret(_I32(0))
     return module
@@ -159,7 +159,7 @@ def _results(context: Any, builder: ir.IRBuilder, kind: Kind, value: Any) -> Ite
 
 
 def _runtime() -> ir.Module:
-    """Write what compiled kernels ask of numba at run time: blocks of memory that are counted (`MemInfo`), and a shape.
+    """Write numba's functions that compiled kernels call: counted blocks of memory (`MemInfo`), and reshaping.
 
     A block begins with its count of references, two fields unused here, the address of its data and their size.
     """
@@ -208,7 +208,7 @@ def _write_allocation(module: ir.Module, name: str, malloc: ir.Function) -> None
 
 
 def _write_reshape(module: ir.Module) -> None:
-    """Write the strides of an array's new shape; numba lets contiguous arrays only take one."""
+    """Write the strides of an array's new shape; numba reshapes contiguous arrays only."""
     lengths = _I64.as_pointer()
     builder, given = _begin(
         module, "numba_attempt_nocopy_reshape", _I32, [_I64, lengths, lengths, _I64, lengths, lengths, _I64, _I32]

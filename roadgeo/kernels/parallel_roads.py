@@ -1,6 +1,6 @@
 """Kernels of `roadgeo.roads.simplification`: roads that run beside each other, such as the two ways of a motorway.
 
-Edges are those of `kernels.simplification`; `lengths` (E,) are theirs.
+Edges have the layout of `kernels.simplification`; `lengths` (E,) are their lengths.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tu
 def find_twins(
     edges: Int32s2, offsets: Ints1, coords: Floats2, lengths: Floats1, by_ends: Ints1, distance: float
 ) -> Ints1:
-    """Find edges that run beside each other between the same two nodes: (E,) the first of those that each is one of.
+    """Find edges that run beside each other between the same two nodes: (E,) the first of each edge's twins, or itself.
 
     Twins are everywhere nearer to each other than `distance`, compared at equal shares of their lengths.
 
@@ -124,9 +124,9 @@ def find_mates(
     Returns
     -------
     mate : (S,) int64
-        -1 where there is none.
+        -1 for a sample without a mate.
     apart : (S,) float64
-        Distance to the mate, `distance` where there is none.
+        Distance to the mate, `distance` for a sample without a mate.
     touch : (2 E,) int64
         The sample nearest to each end of each edge, in any direction, of edges that do not meet it there, or -1.
     """
@@ -183,7 +183,7 @@ def tie_runs(
     starts, edge, mate, apart
         Samples and their mates, as of `find_mates`.
     split_distance : float
-        Where two roads part, they are one until they are this far apart.
+        Two roads that part are a single road until they are this far apart.
     least : float
         Shorter runs are left alone.
 
@@ -243,7 +243,7 @@ def roads_alongside(
     xy, along : (S, 2) float64
         Points on roads, and unit vectors along the road.
     reach : (S,) float64
-        Of two points, one lies beside the other if it is no further than the larger of theirs ahead or behind.
+        Two points lie beside each other if neither is further ahead or behind than the larger of their two reaches.
     least, most : float
         Only roads between these distances count.
     min_cos : float

@@ -67,7 +67,7 @@ def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> i
     matched : (N,) int64
         Partners or -1; the losers' are set to -1.
     distance : (N,) float64
-        Of each to its partner.
+        Distance from each point to its partner.
     """
     n = matched.shape[0]
     size = 4
@@ -121,7 +121,7 @@ def match_all(
     matched : (N,) int64
         Filled with map intersections or -1.
     distance : (N,) float64
-        Filled with metres, `radius` where there is none.
+        Filled with metres, `radius` for an intersection without a partner.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Branches of two intersections compared.
 
-Branches are unit vectors scaled to 127 and rounded, (N, R, 2) int8 with zeros behind the last: comparing two takes
-some products and no trigonometry, an intersection takes 2 R bytes, and rounding turns one by less than 0.4 degrees.
+Branches are unit vectors scaled to 127 and rounded, (N, R, 2) int8 with zeros behind the last. A comparison takes a few
+products and no trigonometry, an intersection takes 2 R bytes, and rounding turns a branch by less than 0.4 degrees.
 """
 
 import math
@@ -26,9 +26,9 @@ def rays_agree(
     j11: float,
     min_cos: float,
 ) -> bool:
-    """Return whether the branches of query intersection i, as a map would show them, agree with those of j on the map.
+    """Return whether the branches of query intersection i, mapped, agree with the branches of map intersection j.
 
-    Each branch takes the nearest partner that is still free; all branches of the poorer of the two must have found one.
+    Each branch takes the nearest free partner. Every branch of the intersection with fewer branches must find one.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Growth of a hypothesis by roads alone: from the roads around one intersection outwards over the whole query.
 
-The parameters are those of `kernels.adjustment`, between normalised coordinates: query (x - x0) / half_size and
+The model has the parameters of `kernels.adjustment`, between normalised coordinates: query (x - x0) / half_size and
 reference (X - X0) / unit.
 """
 
@@ -18,7 +18,7 @@ from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
 
-#: Points of the first stage, and how many times more each further one has; of more points than these, evenly chosen.
+#: Points of the first stage, the factor by which they grow at each stage, and the most; more are thinned out evenly.
 _FIRST, _MORE, _ENOUGH = 60, 1.45, 120
 #: Search radii of a stage's steps, metres: a proposal's scale and turn are rougher than a grown map's predictions.
 _FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
@@ -138,10 +138,9 @@ def share_on_roads(
     min_cos: float,
     roads: RoadBuckets,
 ) -> tuple[float, float]:
-    """Return which share of the points lies on roads that run their way (see `fit_to_roads`), and their closeness.
+    """Return the share of points on roads of their direction (see `fit_to_roads`), and their mean closeness.
 
-    A point lies on a road nearer than `radius` metres; its closeness falls from 1 on the road to 0 there. Of all points
-    the mean is returned.
+    A point is on a road that is nearer than `radius` metres. Its closeness falls from 1 on the road to 0 at `radius`.
     """
     segments, starts, ids, grid, shape = roads
     at = origin[0], origin[1]
@@ -182,7 +181,7 @@ def grow_by_roads(
     points, directions
         As in `fit_to_roads`; points nearest to (0, 0) first.
     closeness : (M,) float64
-        Filled with that of all points (see `share_on_roads`), or -1: given up.
+        Filled with the mean closeness of all points (see `share_on_roads`); -1 for a map that was given up.
     """
     n = points.shape[0]
     closeness[:] = 0.0 if n > 0 else -1.0

@@ -1,9 +1,9 @@
 """The roads around a place as rings of bits: a turn rotates words, and a step of scale moves them to the next ring.
 
-Around a place lie rings whose radii grow in equal ratio, each divided into 64 bearings. A word for each ring holds at
-which of them roads pass that run along the bearing, another those that run across it. So all roads around one
-intersection are compared with those around another in a few instructions for each ring. (Log-polar bins, as in shape
-contexts: Belongie, Malik and Puzicha, PAMI 2002.)
+Around a place lie rings whose radii grow in equal ratio, each divided into 64 bearings. Each ring has two words: bits
+of the first mark bearings at which a road runs along the bearing, bits of the second mark roads across it. The roads
+around two intersections are compared in a few instructions for each ring. (Log-polar bins, as in shape contexts:
+Belongie, Malik and Puzicha, PAMI 2002.)
 """
 
 import math
@@ -18,7 +18,7 @@ __all__ = ["BEARINGS", "RINGS", "WORDS", "count_bits", "draw_rings", "mark_rings
 
 BEARINGS = 64
 RINGS = 32  # loops over a multiple of 8 words are quicker than over fewer
-#: Of each place: those of roads along the bearing, from the innermost ring outwards, then those across.
+#: Words of a place: first the roads along the bearing, from the innermost ring outwards, then the roads across it.
 WORDS = 2 * RINGS
 
 
@@ -33,7 +33,7 @@ def draw_rings(cells: Floats2, places: Ints1, radii: Floats1, raster: Raster, wo
     places : (M,) int64
         Which of them.
     radii : (RINGS,) float64
-        Of the middles of the rings, cells.
+        Radii of the rings' middles, cells.
     words : (N, WORDS) uint64
         Filled for these. Bit b stands for the bearing (b + 1/2) / 64 of a whole turn, counterclockwise from east.
     """
@@ -65,7 +65,7 @@ def mark_rings(rings: Ints1, bearings: Floats1, along: Ints1, own: Ints1, first_
     Parameters
     ----------
     rings : (P,) int64
-        The ring that a point lies in at the smallest scale; at each next one it is one further out.
+        The ring that a point lies in at the smallest scale; each further scale moves it out by a ring.
     bearings : (P,) float64
         Radians.
     along : (P,) int64

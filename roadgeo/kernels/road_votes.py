@@ -28,9 +28,9 @@ _LEAST_RATE = 0.03
 class Places(NamedTuple):
     """Intersections of the map.
 
-    `cells` (N, 2) are cells from the raster's corner, `directions` (N, R) those of branches (see `WHOLE_TURN`), of
-    which the first `counts` (N,) are there, `density` (N,) the chance of a point of any direction to meet a road there,
-    and `rings` (N, WORDS) the roads around (see `kernels.road_rings`).
+    `cells` (N, 2) are cells from the raster's corner. `directions` (N, R) hold the directions of branches (see
+    `WHOLE_TURN`); the first `counts` (N,) of a row are valid. `density` (N,) is the chance that a point of any
+    direction meets a road there, and `rings` (N, WORDS) are the roads around (see `kernels.road_rings`).
     """
 
     cells: Floats2
@@ -78,18 +78,18 @@ def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: 
     branches = np.uint64(0)
     for t in range(m):
         branches |= np.uint64(1) << np.uint64(_bearing(int(directions[j, t])))
-    # two angles and the turn are rounded: agreeing roads lie up to one and a half bearings further apart than it is
+    # two angles and the turn are rounded: agreeing roads may lie one and a half bearings more than `tolerance` apart
     for _ in range((tolerance >> _BITS) + 2):
         branches |= turn_bits(branches, 1) | turn_bits(branches, -1)
-    # turns at which no ray lacks a branch, one does, and two or more do
-    none, one, more = ~np.uint64(0), np.uint64(0), np.uint64(0)
+    # turns at which no ray lacks a branch, a single ray does, and two or more do
+    none, single, more = ~np.uint64(0), np.uint64(0), np.uint64(0)
     for k in range(rays.shape[0]):
         near = turn_bits(branches, -_bearing(rays[k]))
-        more |= one & ~near
-        one = (one & near) | (none & ~near)
+        more |= single & ~near
+        single = (single & near) | (none & ~near)
         none &= near
     lacking = rays.shape[0] - m
-    return none if lacking <= 0 else none | one if lacking == 1 else none | one | more
+    return none if lacking <= 0 else none | single if lacking == 1 else none | single | more
 
 
 @kernel(writes=("turns",))
@@ -103,12 +103,12 @@ def find_turns(rays: Ints1, directions: Int32s2, counts: Ints1, j: int, toleranc
     rays : (R,) int64
         Directions of the query's branches (see `WHOLE_TURN`).
     directions : (M, R') int32
-        Those of the map's, of which the first `counts` (M,) are there.
+        Directions of the map's branches; the first `counts` (M,) of a row are valid.
     tolerance : int
         How far branches may be apart.
     turns : (MAX_TURNS,) int64
-        Filled with counterclockwise turns, at most half a turn either way, the mean over the branches that agree; those
-        close to one listed before are left out.
+        Filled with counterclockwise turns, at most half a turn either way: means over the branches that agree. Turns
+        close to a turn listed before are left out.
 
     Returns
     -------
@@ -182,9 +182,9 @@ def vote(
 ) -> tuple[int, int]:
     """Lay the roads around a query intersection on those around map intersections; keep the best.
 
-    Each turn that the branches allow is tried at every scale. The score is how many points meet roads beyond those
-    that would by chance, if the rings of the place were turned at random, in standard deviations of that number; of all
-    scales of one turn the best.
+    Each turn that the branches allow is tried at every scale, and the best scale of each turn counts. The score is the
+    number of points that meet roads, less the number expected by chance if the rings of the place were turned at
+    random, in standard deviations of the latter.
 
     Parameters
     ----------
@@ -201,8 +201,8 @@ def vote(
     least : int
         Scales at which fewer points are in reach are left out.
     votes : (K, 4) float64
-        (map intersection, turn in radians, scale, standard deviations), the first `kept` of them a heap, worst first;
-        goes on to be one.
+        (map intersection, turn in radians, scale, standard deviations). The first `kept` rows are a heap, worst first,
+        and the rows filled are a heap again afterwards.
 
     Returns
     -------
@@ -249,7 +249,7 @@ def vote(
                 if beyond > best:
                     best, where = beyond, s
             if where >= 0:
-                slot = kept if kept < votes.shape[0] else 0  # the last, or that of the worst vote
+                slot = kept if kept < votes.shape[0] else 0  # the next free slot, or the worst vote's
                 kept = min(kept + 1, votes.shape[0])
                 votes[slot, 0], votes[slot, 1], votes[slot, 2] = j, turns[t] * _UNIT, scales[where]
                 votes[slot, 3] = best
@@ -300,7 +300,7 @@ def improve_votes(
     turns, factors : float64
         Steps: radians added, and factors of the scale.
     points : RoadPoints
-        Those of the nearest scale are taken.
+        The points of the nearest scale are used.
     """
     for k in range(votes.shape[0]):
         j, turn0, scale0 = int(votes[k, 0]), votes[k, 1], votes[k, 2]

@@ -1,7 +1,7 @@
 """Roads as short straight segments in buckets: the nearest one to a point, and how well two networks cover each other.
 
-`segments` (S, 4) are x1, y1, x2, y2; bucket c lists the segments that touch it, `ids[starts[c]:starts[c + 1]]`. `grid`
-and `shape` are those of `kernels.buckets`.
+`segments` (S, 4) are x1, y1, x2, y2; bucket c lists the segments that touch it, `ids[starts[c]:starts[c + 1]]`. See
+`kernels.buckets` for `grid` and `shape`.
 """
 
 import math
@@ -116,7 +116,7 @@ def nearest_road(
     Returns
     -------
     distance, foot x, foot y, direction x, direction y
-        Distance inf where there is none.
+        The distance is inf if no road is within the radius.
     """
     best = radius * radius
     fx, fy, ux, uy = 0.0, 0.0, 0.0, 0.0
@@ -224,7 +224,7 @@ def shares_near_roads(
 ) -> None:
     """Fill `shares` (M,) with the share of the points near roads under each of `shifts` (M, 2), metres.
 
-    Points count by `weights` (S,), at least one of them more than 0; the rest is as in `road_residuals`.
+    Points count by `weights` (S,), which may not all be 0; the rest is as in `road_residuals`.
     """
     total = 0.0
     shares[:] = 0.0
@@ -242,7 +242,7 @@ def shares_near_roads(
 
 @kernel()
 def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos: float, roads: RoadBuckets) -> bool:
-    """Whether `nearest_road` would find one: the first that is met is enough."""
+    """Return whether `nearest_road` would find a road; stop at the first."""
     segments, starts, ids, grid, shape = roads
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return False
@@ -307,9 +307,9 @@ def count_residuals(
     forward: Floats2,
     backward: Floats2,
 ) -> None:
-    """Fill histograms of how far the query's roads lie from roads of the map, and the map's from those of the query.
+    """Fill histograms of the distances from the query's roads to the map's roads, and from the map's to the query's.
 
-    One for each piece of the frame.
+    Each piece of the frame has a histogram of its own.
 
     Parameters
     ----------
@@ -331,8 +331,8 @@ def count_residuals(
     piece_px, columns : float, int
         Width of the frame's pieces, and how many of them are side by side.
     forward, backward : (P, B + 1) float64
-        P pieces, row by row; B bins of equal width up to `radius`, and roads without one nearer. The first counts
-        weights, the second pixels of road.
+        P pieces, row by row; B bins of equal width up to `radius`, and a last bin for roads without a road nearer than
+        that. `forward` counts weights, `backward` pixels of road.
     """
     segments, starts, ids, grid, shape = roads
     n = forward.shape[1] - 1

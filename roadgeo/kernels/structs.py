@@ -1,6 +1,6 @@
 """Values that travel together through kernels, as NamedTuples.
 
-Planes are in metres (reference) or pixels, y up (query). `grid` and `shape` are those of `kernels.buckets`.
+Planes are in metres (reference) or pixels, y up (query). See `kernels.buckets` for `grid` and `shape`.
 """
 
 from typing import NamedTuple
@@ -140,7 +140,7 @@ class RoadSamples(NamedTuple):
     xy: Floats2  # (S, 2)
     directions: Floats2  # (S, 2) unit vectors along the road
     cells: Ints1  # (S,) the cell of the frame that each lies in
-    weight: float  # of one, against an observation of standard deviation `AdjustLimits.sigma_m`
+    weight: float  # weight of a point, relative to an observation of standard deviation `AdjustLimits.sigma_m`
     half_side: float  # half of the frame's longer side: the unit of k1
 
 
@@ -165,9 +165,9 @@ class Met(NamedTuple):
     """Roads that road points met, in S x n numbers for n parameters."""
 
     rows: Floats2  # (S, n) derivatives of the points' places across the roads
-    residuals: Floats1  # (S,) metres across to the roads, NaN where none is met
-    sigmas: Floats1  # (S,) standard deviations of that
-    own: Floats1  # (S,) of it where the places are known, in that of the middle of the frame
+    residuals: Floats1  # (S,) metres across to the roads, NaN where no road is met
+    sigmas: Floats1  # (S,) standard deviations of the residuals
+    own: Floats1  # (S,) sigma at a known place, relative to its value in the middle of the frame
     searched: Bools1  # (S,) whether the place was sure enough
 
 

@@ -20,7 +20,7 @@ LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range
 
 @kernel()
 def _label(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> int:
-    """Separate pixels of chains from those of nodes by their number of neighbours; return the sum of the latter's."""
+    """Label each pixel as chain or node by its number of neighbours; return the summed neighbours of node pixels."""
     flat = states.ravel()
     stride = np.uint64(states.shape[1])
     slots = 0
@@ -90,8 +90,8 @@ def _mean_places(members: Int32s1, first: Ints1, n_nodes: int, width: int) -> Fl
 def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, Bools1, Int32s2, Int32s1, Ints1]:
     """Split a skeleton into nodes and chains.
 
-    A node is a cluster of touching pixels with three ROAD neighbours or more, a pixel with one, a pixel that touches
-    SOLID (an *open* end: the road goes on unseen), or one pixel of a ring that has none of these.
+    A node is a cluster of touching pixels with three or more ROAD neighbours, a pixel with one ROAD neighbour, a pixel
+    that touches SOLID (an *open* end: the road goes on unseen), or any one pixel of a ring without such pixels.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def smooth_chains(
     ----------
     distance : (H, W) float32
     chain, chain_offsets : (C,) int32, (E + 1,) int64
-        Flat indices of pixels, none in the outermost rows and columns: those of chain e, possibly none, are
+        Flat indices of pixels; no pixel lies in the outermost rows and columns. Chain e, which may be empty, is
         `chain[chain_offsets[e]:chain_offsets[e + 1]]`.
     ends : (E, 4) float64
         Column, row of the nodes at the two ends.

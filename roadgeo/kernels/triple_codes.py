@@ -9,8 +9,8 @@ degrees).
 Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 table cells. An entry is a uint64:
 `anchor << 40 | slot of Y << 37 | slot of Z << 34 | sides << 24 | six positions within the cells`, slots being columns
 of `neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
-compares all six. `sides` says on which sides of each vertex the road along a tangent leaves it: most entries whose
-angles agree differ in them, before anything else of the map is read. A cell's entries are sorted by them.
+compares all six. `sides` holds the sides on which the road along a tangent leaves each vertex: most entries whose
+angles agree differ in their sides, before anything else of the map is read. A cell's entries are sorted by `sides`.
 """
 
 import math
@@ -88,9 +88,9 @@ def vertex_codes(
 ) -> int:
     """Write the codes of vertex i of the triangle i, j, k; return how many.
 
-    A code is a sorted pair of units u1 <= u2, and 3 s1 + s2, the sides of the two (see `find_sides`) as the equilateral
-    frame sees them. There is one for every two of the vertex's tangents; of more than `limit`, those that cross most
-    openly.
+    A code is a sorted pair of units u1 <= u2, and 3 s1 + s2, the sides of the two (see `find_sides`) in the equilateral
+    frame. Every pair of the vertex's tangents has a code; beyond `limit` codes, the pairs that cross at the largest
+    angles are kept.
     """
     e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
     e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
@@ -153,7 +153,7 @@ def neighbour_pair(
     xy: NDArray[np.float64], neighbours: NDArray[np.int32], a: int, s: int, t: int, min_shape: float
 ) -> tuple[int, int, int, int]:
     """Return b, c and their slots: neighbours s and t of a, counterclockwise; b = -1 where the triangle is too thin."""
-    b, c = int(np.int64(neighbours[a, s])), int(np.int64(neighbours[a, t]))  # of one type everywhere
+    b, c = int(np.int64(neighbours[a, s])), int(np.int64(neighbours[a, t]))  # the same type everywhere
     turn = orient(xy, a, b, c, min_shape)
     if turn == 0:
         return -1, -1, s, t

@@ -25,10 +25,10 @@ __all__ = ["count_alike", "gather", "look_up_each", "next_alike", "vertex_probes
 
 GUARDS = 0x888888
 
-#: In cells of more entries those whose sides are not alike are passed over; in smaller ones that would take longer.
+#: In longer cells, entries whose sides are not alike are skipped; in shorter cells skipping would take longer.
 LONG_CELL = 32
 
-#: Bit r of `ALIKE[q]`: whether sides r of a vertex of the map are those of q or more, or fewer, on both tangents.
+#: Bit r of `ALIKE[q]`: whether sides r of a map vertex contain sides q, or are contained in q, on both tangents.
 ALIKE = np.array(
     [
         sum(
@@ -151,9 +151,9 @@ def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
 
 @kernel(forceinline=True)
 def _places(entry: np.uint64, turn: int, ref_neighbours: NDArray[np.int32]) -> tuple[int, int, int]:
-    """Return the map's triple of an entry, the partner of the query's anchor first, or -1: it is none.
+    """Return the map's triple of an entry, the partner of the query's anchor first; -1 for an invalid entry.
 
-    A file's bits may have been flipped: no entry is believed.
+    A damaged file may hold any bits, so every number is checked.
     """
     x = np.int64(entry >> np.uint64(40))
     y = np.int64((entry >> np.uint64(37)) & np.uint64(7))
@@ -172,18 +172,18 @@ def _places(entry: np.uint64, turn: int, ref_neighbours: NDArray[np.int32]) -> t
 
 @kernel(forceinline=True)
 def _fit_affine(
-    one: _Triangle, ref_xy: NDArray[np.float64], x: int, y: int, z: int, limits: TripleLimits
+    seen: _Triangle, ref_xy: NDArray[np.float64], x: int, y: int, z: int, limits: TripleLimits
 ) -> tuple[bool, float, float, float, float]:
     """Return the 2 x 2 map (row-major) from the query's triple to the map's triple x, y, z, and whether it passes."""
     bx, by = ref_xy[y, 0] - ref_xy[x, 0], ref_xy[y, 1] - ref_xy[x, 1]
     cx, cy = ref_xy[z, 0] - ref_xy[x, 0], ref_xy[z, 1] - ref_xy[x, 1]
-    det = (bx * cy - by * cx) / one.cross
+    det = (bx * cy - by * cx) / seen.cross
     if det < limits.scale[0] * limits.scale[0] or det > limits.scale[1] * limits.scale[1]:
         return False, 0.0, 0.0, 0.0, 0.0
-    j00 = (bx * one.acy - cx * one.aby) / one.cross
-    j01 = (cx * one.abx - bx * one.acx) / one.cross
-    j10 = (by * one.acy - cy * one.aby) / one.cross
-    j11 = (cy * one.abx - by * one.acx) / one.cross
+    j00 = (bx * seen.acy - cx * seen.aby) / seen.cross
+    j01 = (cx * seen.abx - bx * seen.acx) / seen.cross
+    j10 = (by * seen.acy - cy * seen.aby) / seen.cross
+    j11 = (cy * seen.abx - by * seen.acx) / seen.cross
     # singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = |J|^2
     square = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
     passes = not square * limits.min_ratio > det * (1.0 + limits.min_ratio * limits.min_ratio)
@@ -193,7 +193,7 @@ def _fit_affine(
 @kernel(forceinline=True)
 def _agree(
     branches: NDArray[np.int8],
-    one: _Triangle,
+    seen: _Triangle,
     ref_branches: NDArray[np.int8],
     x: int,
     y: int,
@@ -206,9 +206,9 @@ def _agree(
 ) -> bool:
     """Return whether the branches at all three vertices agree."""
     return (
-        rays_agree(branches, one.a, ref_branches, x, j00, j01, j10, j11, min_cos)
-        and rays_agree(branches, one.b, ref_branches, y, j00, j01, j10, j11, min_cos)
-        and rays_agree(branches, one.c, ref_branches, z, j00, j01, j10, j11, min_cos)
+        rays_agree(branches, seen.a, ref_branches, x, j00, j01, j10, j11, min_cos)
+        and rays_agree(branches, seen.b, ref_branches, y, j00, j01, j10, j11, min_cos)
+        and rays_agree(branches, seen.c, ref_branches, z, j00, j01, j10, j11, min_cos)
     )
 
 
@@ -241,7 +241,7 @@ def next_alike(
 ) -> tuple[int, int]:
     """Return the next run of entries with the same sides that are alike at all three vertices (see `vertex_probes`).
 
-    Entries `e` to `end` are sorted by their sides. Returns (end, end) where there is none.
+    Entries `e` to `end` are sorted by their sides. Returns (end, end) after the last run.
     """
     while e < end:
         sides = _sides(entries[e])
@@ -319,9 +319,9 @@ def _find_cells(
 
 @kernel()
 def _look_up(
-    query: TripleQuery, one: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
+    query: TripleQuery, seen: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
 ) -> tuple[int, int]:
-    """Append the map's triples whose codes agree with those of a query triple; return (all hits, entries compared).
+    """Append the map's triples whose codes agree with a query triple's; return (all hits, entries compared).
 
     See `look_up_each`.
     """
@@ -329,7 +329,7 @@ def _look_up(
     ref_xy, ref_branches, ref_neighbours, starts, entries = table
     codes = np.empty((3, limits.codes_per_vertex, 3), np.int64)
     n = np.empty(3, np.int64)
-    triple_codes(query.xy, query.tangents, query.sides, one.a, one.b, one.c, limits.codes_per_vertex, codes, n)
+    triple_codes(query.xy, query.tangents, query.sides, seen.a, seen.b, seen.c, limits.codes_per_vertex, codes, n)
     m, listed = _list_probes(codes, n, limits.tolerance, np.empty((256, 7), np.int64))
     ends = np.empty((m + 1, 2), np.int64)
     _find_cells(listed, m, starts, entries, ends)
@@ -357,13 +357,13 @@ def _look_up(
                 x, y, z = _places(entry, turn, ref_neighbours)
                 if x < 0:
                     continue
-                passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
-                if not passes or not _agree(branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos):
+                passes, j00, j01, j10, j11 = _fit_affine(seen, ref_xy, x, y, z, limits)
+                if not passes or not _agree(branches, seen, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos):
                     continue
                 if n_hits >= ids.shape[0]:
                     return n_hits, compared
-                ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
-                ids[n_hits, 3], ids[n_hits, 4] = one.t, z
+                ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, seen.s, y
+                ids[n_hits, 3], ids[n_hits, 4] = seen.t, z
                 affine[n_hits, 0], affine[n_hits, 1] = j00, j01
                 affine[n_hits, 2], affine[n_hits, 3] = j10, j11
                 n_hits += 1
@@ -380,7 +380,7 @@ def look_up_each(
     limits: TripleLimits,
     hits: Hits,
 ) -> tuple[int, int]:
-    """Find the map's triples whose codes agree with those of one anchor's triples (a, slot s, slot t).
+    """Find the map's triples whose codes agree with the triples of an anchor (a, slot s, slot t).
 
     The triples, `slots` (T, 2), are looked up one after another until there is no room for hits or enough was compared.
     A hit is `hits.ids` = (A, slot of b, B, slot of c, C), b and c counterclockwise after a, and `hits.affine` = the
@@ -390,8 +390,8 @@ def look_up_each(
     for i in range(slots.shape[0]):
         if n_hits == hits.ids.shape[0] or n_compared > max_compared:
             break
-        one = _triangle(query, a, slots[i, 0], slots[i, 1])
-        n_hits, compared = _look_up(query, one, table, limits, hits, n_hits)
+        seen = _triangle(query, a, slots[i, 0], slots[i, 1])
+        n_hits, compared = _look_up(query, seen, table, limits, hits, n_hits)
         n_compared += compared
     return n_hits, n_compared
 
