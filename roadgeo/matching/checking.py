@@ -1,4 +1,4 @@
-"""Is a given place right? The best place near it, by how much it leads all others there, and how far off it lies."""
+"""Is a given place right? Find the best place near it, its lead over all others there, and its distance."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 Verdict = Literal["agrees", "off", "unknown"]
 
 
-#: Log10 odds that the best place must have against each other place nearby, and where it is the given one: of a dozen
-#: places that fit by chance, the best is seldom that.
+#: Log10 lead that the best place needs over each other place nearby; less if it is the given place, which is seldom the
+#: best of a dozen places that fit by chance.
 _MIN_LOG10, _MIN_LOG10_AS_GIVEN = 2.0, 1.0
 #: Chi-squared of a displacement that counts as off: met by chance once in 1000 with 4 degrees of freedom.
 _MIN_CHI2 = 18.5
 #: Length of road, metres, that mask and map must each show.
 _MIN_ROADS_M = 300.0
-#: Refinement that moves the corners by more than this, metres, has lost its way.
+#: A refinement that moves the corners by more than this, metres, has diverged.
 _MAX_DRIFT_M = 40.0
 #: Half the distance between the lines of a dual carriageway, metres, up to 1.8 times as much.
 _TWIN_M = 10.0
@@ -69,7 +69,7 @@ class Checked:
     log10_lead, rival : float, Displacement or None
         Log10 odds of the best place against its hardest rival, and where that lies.
     agreeing, agreeing_as_given : float or None
-        Share of the roads, of mask and map, that agree at the best place, and at the given one.
+        Share of the roads of mask and map that agree at the best place, and at the given place.
     matched : (N,) int or None
         Map intersection of each query intersection, or -1.
     """
@@ -136,7 +136,7 @@ class _Judge:
         return [move_about(center, shift) @ self.start for shift in shifts]
 
     def refine_all(self, starts: Sequence[FloatArray]) -> list[_Place]:
-        """Refine places roughly, and return those that are different ones, the one that agrees best first."""
+        """Refine places roughly; return the distinct ones, by falling agreement."""
         places = [self.refine(start, 200) for start in starts]
         distinct: list[_Place] = []
         for place in sorted(places, key=lambda place: -place.worth):
@@ -145,7 +145,7 @@ class _Judge:
         return distinct
 
     def refine(self, start: FloatArray, n_points: int | None) -> _Place:
-        """Refine a place until its matches settle; where it loses its way, it stays as it is."""
+        """Refine a place until its matches settle; keep it unchanged if the refinement diverges."""
         matrix, refined = start, None
         scene = self.scene if n_points else self.without_twins(start)
         matched = np.full(len(self.scene.intersections), -1)
@@ -163,8 +163,8 @@ class _Judge:
     def without_twins(self, matrix: FloatArray) -> Scene:
         """Return the scene without road points that have parallel roads of the map on both sides.
 
-        A mask often shows a dual carriageway as one line, halfway between the two of the map: were it laid on either,
-        the frame would be off by half their distance.
+        A mask often shows a dual carriageway as a single line, halfway between the two lines of the map. A fit to
+        either line would be off by half their distance.
         """
         scene = self.scene
         points, along, _ = points_on_map(matrix, scene)
@@ -178,7 +178,7 @@ class _Judge:
         return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())
 
     def agreeing(self, matrix: FloatArray) -> float:
-        """Return the share of the roads, of mask and map, that agree."""
+        """Return the share of the roads of mask and map that agree."""
         found, _, _ = agreement(matrix, self.scene, self.index)
         return (found.forward + found.backward) / 2.0
 
@@ -201,7 +201,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= APART_M]
     compare = judge.evidence.compared_with(best.matrix)
     leads = [compare(rival.matrix)[1] for rival in rivals]
-    lead, hardest = min(zip(leads, rivals, strict=True), key=lambda one: one[0], default=(0.0, None))
+    lead, hardest = min(zip(leads, rivals, strict=True), key=lambda pair: pair[0], default=(0.0, None))
     if best.refined is None or hardest is None:
         return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")
     found = judge.displacement(best)
@@ -222,8 +222,8 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     agrees = off <= options.tolerance_m
     needed = _MIN_LOG10_AS_GIVEN if agrees else _MIN_LOG10
     if lead < needed:
-        told = f"the best leads by 10^{lead:.1f}, 10^{needed:g} is needed"
-        nothing = f"no place within {options.search.reach_m:g} m stands out: {told}"
+        leads_by = f"the best leads by 10^{lead:.1f}, 10^{needed:g} is needed"
+        nothing = f"no place within {options.search.reach_m:g} m stands out: {leads_by}"
         return replace(known, displacement=None, matrix=None, matched=None, reason=nothing)
     if sigma > options.max_sigma_m:
         return replace(known, reason=f"the roads place it to {sigma:.1f} m only")

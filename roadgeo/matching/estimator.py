@@ -28,20 +28,20 @@ __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
 #: A place is fitted through a lens once, and again where this much more of the mask's roads agrees.
 _BETTER = 0.05
-#: A place is laid no better if its likelihood is lower than this (log10), or, laid roughly and less roughly, than these
-#: parts of the best one's: of 277 right places all but one led the best other one by a fifth as soon as laid roughly.
+#: Stop refining a place below this log10 likelihood, or, after the first and second refinement, below these parts of
+#: the best place's: 276 of 277 right places led every other place by a fifth after the first.
 _LEAST_LIKELY, _BEHIND = 0.7, (0.8, 0.9)
-#: A place that explains less than this part of the best one, laid once, is not laid again. One that grew by roads is
-#: not laid, if it explains less as it grew: of 71 right ones none explained less than 0.9.
+#: A place that explains less than this part of the best place is not refined again after the first refinement. A place
+#: that grew by roads is not refined at all if it explains less as grown: the least of 71 right places explained 0.9.
 _HARDLY = 0.5
-#: Places that lead all others so far by as many powers of ten are compared with those nearby, and a lens is looked for
-#: behind those that lead these, too: of ten places behind lenses, or laid on a part, the weakest led by 3.2.
+#: A place that leads all earlier places by this score is compared with places nearby; if it leads these too, a lens is
+#: tried. The weakest of ten right places with a lens, or fitted to a part only, led by 3.2.
 _LEADING = 2.0
-#: As of `RefineOptions`, for places that grew by roads: false roads abound there.
+#: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
-#: Seconds that each step takes, roughly, measured on lattices, where searches are longest: an intersection of the query
-#: that is looked for, a triple of the map like one of the query's, a place that is screened or voted for, a hypothesis
-#: that grows, and one that is compared with the map, with each road point.
+#: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
+#: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis, and comparing a
+#: hypothesis with the map, plus the time for each road point.
 _ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _VERIFIED_S, _VERIFIED_POINT_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 1e-3, 3.5e-6
 
 
@@ -60,9 +60,9 @@ class MatchOptions:
     lens : bool
         Whether a lens is looked for behind promising places.
     max_places : int
-        The sweeps end too when this many places were screened on a map of 15,000 intersections; on a larger one more
-        by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
-        that took more than half a second and were located, all but two had been found among the first 7,000 places.
+        The sweeps also end when this many places were screened on a map of 15,000 intersections. On a larger map the
+        limit grows by the root of the ratio. Where streets are alike, proposals abound, and late proposals are seldom
+        right: 29 of 31 masks that took more than half a second had been found among the first 7,000 places.
     within : (west, south, east, north) or None
         Degrees: the middle of the frame is known to lie there (see `geometry.areas`).
     """
@@ -115,9 +115,7 @@ class TripleEstimator:
         self.sweeps.members.append(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
-        """Yield, for one anchor after another, the hypotheses that grew.
-
-        Triples propose them, then roads.
+        """Yield the hypotheses that grew from each anchor; triples propose first, then roads.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
@@ -158,13 +156,13 @@ class TripleEstimator:
             self._look_for(anchor)
             self.events.note("voted", anchor, n_proposed)
             fresh: list[Hypothesis] = []
-            for one in grown:
-                hypothesis = Hypothesis.at(one.matrix, self.scene, self.index, one.closeness)
+            for place in grown:
+                hypothesis = Hypothesis.at(place.matrix, self.scene, self.index, place.closeness)
                 is_known = any(self._is_found_again(other, hypothesis) for other in known)
                 if not is_known and not any(self.same(other, hypothesis) for other in fresh):
                     fresh += [hypothesis] * self._is_plausible(hypothesis)
             known += fresh
-            self.events.note("grown", [one.matrix for one in fresh])
+            self.events.note("grown", [hypothesis.matrix for hypothesis in fresh])
             yield fresh
 
     def _look_for(self, anchor: int) -> None:
@@ -188,7 +186,7 @@ class TripleEstimator:
         return self._whole
 
     def enough(self) -> bool:
-        """Whether as many places were screened as on one map of all parts' size."""
+        """Return whether the limit of screened places, for a map as large as all parts together, is reached."""
         larger_by = larger(max(self.ledger.n_reference, len(self.index)))
         return self.ledger.n_by_triples >= int(self.options.max_places * larger_by)
 
@@ -205,7 +203,7 @@ class TripleEstimator:
         return kept
 
     def allow(self, proposals: Proposals) -> BoolArray:
-        """Return which proposals put the frame's middle where it may be, and its up where it may point."""
+        """Return which proposals put the middle of the frame, and its up direction, within the limits."""
         j00, j01, j10, j11 = proposals.affine.T
         allowed = np.ones(len(j00), bool)
         if self.near is not None:
@@ -215,14 +213,14 @@ class TripleEstimator:
         return allowed & (self.options.camera.turned_off(j01, j11) < AGREE_DEG)
 
     def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
-        """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
+        """Grow the chosen proposals of an anchor; return those that were not given up, the best supported first."""
         return grow_proposals(self.scene, self.index, proposals, chosen, self.options.camera)
 
     def follow_up(self, proposals: Proposals, chosen: IntArray) -> Iterator[Hypothesis]:
-        """Yield the grown proposals of one anchor that mean different places and that a camera can have seen."""
+        """Yield the grown proposals of an anchor that are different places and that a camera can have seen."""
         self.n_hypotheses += len(chosen)
         grown = self.grow(proposals, chosen)
-        self.events.note("grown", [one.matrix for one in grown])
+        self.events.note("grown", [hypothesis.matrix for hypothesis in grown])
         distinct: list[Hypothesis] = []
         for h in filter(self._is_plausible, grown):
             if not any(self.same(h, other) for other in (*self._whole, *distinct)):
@@ -246,8 +244,8 @@ class TripleEstimator:
         return model.log10_odds
 
     def _verify(self, model: Hypothesis) -> None:
-        """Refine a hypothesis by more and more points, as long as it may be the best place, or its rival."""
-        best = max((one.log10_likelihood for one in self.verified), default=0.0)
+        """Refine a hypothesis with more and more points, as long as it may be the best place, or its rival."""
+        best = max((known.log10_likelihood for known in self.verified), default=0.0)
         if model.by_roads and best > 0.0:
             as_grown = Evidence(self.scene, self.index, sampling(model.matrix, self.scene.size))
             model.log10_likelihood = as_grown.weigh(model.matrix)
@@ -284,12 +282,12 @@ class TripleEstimator:
         model.log10_odds = model.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1))
 
     def _most_elsewhere(self, model: Hypothesis) -> float:
-        """Return the log10 likelihood of the best other place that was met."""
-        likely = sorted(self.verified, key=lambda one: -one.log10_likelihood)
-        return next((one.log10_likelihood for one in likely if not self.same(one, model)), 0.0)
+        """Return the log10 likelihood of the best other verified place."""
+        likely = sorted(self.verified, key=lambda known: -known.log10_likelihood)
+        return next((known.log10_likelihood for known in likely if not self.same(known, model)), 0.0)
 
     def _look_through_lens(self, model: Hypothesis) -> None:
-        """Take a lens into a promising place where one explains it better."""
+        """Add a lens to a promising place if the lens explains it better."""
         index, refined, agreeing = self.index, model.refined, model.found
         if not self.options.lens or refined is None or agreeing is None:
             return
@@ -335,11 +333,11 @@ class TripleEstimator:
         return True
 
     def explained(self, model: Hypothesis) -> float:
-        """Return what a place explains, which compares it with places of other scales (see `statement_px`)."""
+        """Return the likelihood of a place, scaled so that places of different scale compare (see `statement_px`)."""
         return model.log10_likelihood * statement_px(sampling(model.matrix, self.scene.size))
 
     def refinement(self, model: Hypothesis) -> RefineOptions:
-        """Return how a hypothesis is refined."""
+        """Return the options for refining a hypothesis."""
         usual = self.refine_options
         return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if model.by_roads and self.options.roads else usual
 

@@ -16,7 +16,7 @@ __all__ = ["Events", "Ledger", "Scored"]
 
 
 class Scored(NamedTuple):
-    """A hypothesis that was verified, its odds, and the camera's objection if that ended it."""
+    """A verified hypothesis, its score, and the camera's objection if it was refused."""
 
     model: Hypothesis
     log10_odds: float
@@ -29,10 +29,10 @@ class Events:
 
     An event is its kind and its values:
 
-    - "screened": one anchor's `Proposals`, which the user's hints allow (M,), and which put roads on roads (K,);
-    - "voted": an intersection, and how many places it and the roads around it proposed that were to grow;
+    - "screened": an anchor's `Proposals`, which of them the user's hints allow (M,), and which put roads on roads (K,);
+    - "voted": an intersection, and the number of places to grow that it and the roads around it proposed;
     - "grown": homographies (3, 3) that grew;
-    - "refused": the camera's objection, and a homography that grew and that no camera can have seen;
+    - "refused": the camera's objection, and a grown homography that no camera can have seen;
     - "scored": a `Scored`.
     """
 
@@ -58,4 +58,4 @@ class Ledger:
 
     n_reference: int = 0  # intersections of all parts: attempts are bounded as on one map of that size
     n_tried: int = 0
-    n_by_triples: int = 0  # those that triples proposed
+    n_by_triples: int = 0  # places that triples proposed

@@ -1,17 +1,17 @@
-"""One likelihood: how well a place explains the roads of the query, and those of the map in the frame.
+"""The likelihood of a place: how well it explains the query's roads and the map's roads in the frame.
 
-Each piece of the query's roads either lies on a road of the map, off it by a residual, or is false; each piece of the
-map's roads in the frame either is seen, off by a residual, or is missing. Under a place H
+Each piece of the query's roads is either true, off the map's road by a residual, or false. Each piece of the map's
+roads in the frame is either seen, off by a residual, or missing. Under a place H
 
     log L(H) = sum over the query's roads  log[ (1 - f) g(r; sigma) / b + f ]
              + sum over the map's roads    log[ (1 - m) g(r; sigma) / b + m ]
 
-with r the residual, g half a normal density, b the density of residuals where roads lie anyhow, f the share of false
-roads and m that of missing ones. The quality of a query is unknown: sigma, m and f are
-marginalised over a small grid. Neighbouring pieces agree together, so that `statement_m` metres of road count once.
+with r the residual, g a half-normal density, b the density of residuals where roads lie at random, f the share of false
+roads and m the share of missing roads. The quality of a query is unknown: sigma, m and f are marginalised over a small
+grid. Neighbouring pieces agree together, so `STATEMENT_M` metres of road count once.
 
-By itself log L is of little use where streets repeat. A place is scored by its lead over the best other one (see
-`rivals`), and that is measured piece by piece: were two places alike, each piece of the frame would speak for either
+Log L alone is of little use where streets repeat. A place is scored by its lead over the best other place (see
+`rivals`). The lead is measured piece by piece: if two places were alike, each piece of the frame would favour either
 with the same probability.
 """
 
@@ -37,45 +37,44 @@ __all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersecti
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
-#: Range of residuals, in usual deviations, and number of bins; those of roads that agree.
+#: Range of residuals, in usual deviations; number of bins; number of bins of roads that agree.
 _REACH, _BINS, _AGREEING = 4.0, 24, 18
-#: This share of roads that lie anywhere runs along a road piece, as streets go; directions of the map's roads are not
-#: compared with those of the query. Shares of pieces with such a road nearby are rounded to a ladder.
+#: Share of random roads that run along a road piece, as streets go; the directions of the map's roads are not compared
+#: with the query's. The share of pieces with such a road nearby is rounded to a power of `_STEP`.
 _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
 #: Accuracy of the distance to the query's roads, in cells of its raster.
 _BLUR_CELLS = 0.35
-#: Usual distance between a mapped road and the road, and usual error of a traced one.
+#: Usual distance between a mapped road and the true road, and usual error of a traced road.
 MAP_SIGMA_M, PIXEL_SIGMA_PX = 1.8, 1.0
-#: This length of road, of the query and of the map together, counts as one independent statement, but never less than
-#: pixels can show.
+#: This length of road, query and map together, counts as one independent statement, but never less than so many pixels.
 STATEMENT_M, STATEMENT_PX = 480.0, 96.0
-#: Width of the frame's pieces, by which two places are compared; the greater one.
+#: Width of the frame's pieces by which two places are compared: the larger of these two.
 _PIECE_M, _PIECE_PX = 60.0, 12.0
-#: Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and how
-#: many times coarser pixels are than in its middle where it is too far away for that.
+#: Most regions along the frame's longer side in which a place may be contradicted; their least width; and the factor by
+#: which pixels are coarser than in the middle of the frame where ground is too far away to count.
 _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
-#: A region is contradicted where the place explains less than this part of what it explains elsewhere.
+#: A region is contradicted if the place explains less there than this part of its average elsewhere.
 _HARDLY = 0.1
-#: Step of the samples along the map's roads, at least; no less than a cell of the query's raster.
+#: Least step of the samples along the map's roads, which is at least a cell of the query's raster.
 STEP_M = 12.0
-#: Places nearby: shifts of these lengths, spread evenly, and those that lay one of some intersections of the map near
-#: the middle on others around it; they are compared by this number of road points, and the best of them weighed.
+#: Places nearby: evenly spread shifts of these lengths, and shifts that move one of a few map intersections near the
+#: middle to another intersection around it. All are compared by this number of road points; the best are weighed.
 _SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 6
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What agrees at a place.
+    """The agreement of query and map at a place.
 
     Attributes
     ----------
     matched, tested : int
-        Intersections of the query that meet one of the map, and all of them.
+        Intersections of the query that match an intersection of the map, and all intersections of the query.
     forward, backward : float
         Share of the query's roads on roads of the map, and of the map's roads on roads of the query, within three
         standard deviations.
     log10_likelihood : float
-        That of `Evidence`, by the yardstick of the place itself.
+        Likelihood of `Evidence` at the place's own metres per pixel.
     """
 
     matched: int
@@ -101,8 +100,8 @@ class Evidence:
     Attributes
     ----------
     gsd_m : float
-        Metres per pixel by which roads are measured. A place at another scale is compared within as many pixels: within
-        as many metres roads would agree anyhow wherever the frame is laid small.
+        Metres per pixel by which roads are measured. Residuals of a place at another scale are compared in pixels: in
+        metres, roads would always agree where the frame is small on the ground.
     """
 
     def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
@@ -121,9 +120,9 @@ class Evidence:
         return self._log10(seen[0], mapped[0])
 
     def agreement(self, matrix: FloatArray, matched: IntArray) -> Agreement:
-        """Return what agrees at a place, where intersections of the query are `matched` (N,) with the map's, or -1."""
+        """Return the agreement at a place, with the map's intersection `matched` (N,) to each of the query's, or -1."""
         seen, mapped = self._count(matrix, math.inf, (1, 1))
-        forward, backward = (float(one[0, :_AGREEING].sum() / max(one.sum(), 1e-9)) for one in (seen, mapped))
+        forward, backward = (float(bins[0, :_AGREEING].sum() / max(bins.sum(), 1e-9)) for bins in (seen, mapped))
         return Agreement(int((matched >= 0).sum()), len(matched), forward, backward, self._log10(seen[0], mapped[0]))
 
     def _log10(self, seen: FloatArray, mapped: FloatArray) -> float:
@@ -133,15 +132,15 @@ class Evidence:
         return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
 
     def mapped_px(self, matrix: FloatArray) -> float:
-        """Return how much road the map has on observed ground of the frame, pixels."""
+        """Return the length of the map's roads on observed ground of the frame, pixels."""
         return float(self._count(matrix, math.inf, (1, 1))[1].sum())
 
     def compared_with(self, matrix: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
-        """Return what compares a place with others: log10 L of another, and by how much the place leads it.
+        """Return a function of another place that returns its log10 L, and the lead of this place over it (log10).
 
-        The lead counts powers of ten, piece by piece. All are compared by the deviation and the share of false roads
-        that explain the place best, and by the query's roads alone: of many wrong places the best lies where the map
-        shows little that the query lacks, and all others show more in every piece.
+        The lead is measured piece by piece. Every other place is compared with the deviation and the share of false
+        roads that explain this place best, and by the query's roads alone: the best of many wrong places lies where the
+        map shows few roads that the query lacks, and all other places show more of them in every piece.
         """
         seen, mapped = self._count(matrix, self._piece_px, self._shape)
         of_query, of_map = self._ratios(mapped)
@@ -156,9 +155,9 @@ class Evidence:
         return compare
 
     def shared(self, matrix: FloatArray, other: FloatArray) -> float:
-        """Return of which share of the query's roads on roads at another place the same road is met at this one.
+        """Return the fraction of road points matched at `other` that match the same map road at `matrix`.
 
-        A version of the place slides along some roads, and loses others; a block beside meets most roads elsewhere.
+        A variant of the same place slides along some roads and loses others; a neighbouring block matches other roads.
         """
         scene, reach_m = self.scene, tolerance_m(self.gsd_m)
         met = np.empty((len(scene.points), 3))
@@ -171,11 +170,11 @@ class Evidence:
         return float(alike.mean()) if on_road.any() else 0.0
 
     def contradicted(self, matrix: FloatArray) -> float:
-        """Return which share of the roads lies in regions of the frame where the place explains little or nothing.
+        """Return the share of roads in regions of the frame where the place explains little or nothing.
 
-        There the query and the map both show roads, but different ones: a place that fits in part, as in a city built
-        like its own mirror image, is not it. Where only one of them shows roads nothing is contradicted. Far
-        ground of a steep view, which cannot be traced, does not count.
+        In such regions the query and the map both show roads, but different ones: a place that fits only in part, as in
+        a city built like its own mirror image, is wrong. A region where either shows no roads contradicts nothing. Far
+        ground of an oblique view, which cannot be traced, does not count.
         """
         scene = self.scene
         side = max(max(scene.size) / _N_REGIONS, _REGION_M / self.gsd_m)
@@ -194,7 +193,7 @@ class Evidence:
             return 0.0
         least = _HARDLY * max(float(worth[near].sum()), 0.0) * both / both.sum()
         share = float(both[worth < least].sum() / both.sum())
-        return max(share - 0.5 / len(both), 0.0)  # that of half a region is usual: a railway may run through one
+        return max(share - 0.5 / len(both), 0.0)  # half a region is usual: a railway may run through it
 
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
@@ -214,7 +213,7 @@ class Evidence:
     def _ratios(self, mapped: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihood ratios of residuals of the query's roads and of the map's (sigma, share, bin).
 
-        The more roads there are in the frame, the more of the others have one near anyhow.
+        The more roads are in the frame, the more roads of the other side have a neighbour by chance.
         """
         reach = 2.0 * _REACH * self._sigma_m / self.gsd_m / max(self._observed_px, 1.0)
         of_query = _anyhow(_ALONG * reach * float(mapped.sum()))
@@ -232,10 +231,10 @@ class Evidence:
         n_shifts: int = _N_SHIFTS,
         n_anchors: int = _N_ANCHORS,
     ) -> float:
-        """Return log10 L of the best place that a shift leads to.
+        """Return log10 L of the best shifted place.
 
-        Shifts lie on a sunflower spiral, so that all directions and distances are met evenly, and where intersections
-        of the map come to lie on others, unless that takes the middle of the frame out of the circle `near` =
+        Shifts lie on a sunflower spiral, which covers all directions and distances evenly. Further shifts move
+        intersections of the map onto other intersections, if the middle of the frame stays within the circle `near` =
         (x, y, radius), plane metres.
         """
         scene = self.scene
@@ -255,7 +254,7 @@ class Evidence:
         return max((self.weigh(_shifted(matrix, shifts[k])) for k in best), default=0.0)
 
     def _least_shift(self, reach_m: float) -> float:
-        """Shifts no shorter than three times what roads may be apart, and agree: nearer is the place itself."""
+        """Return the factor on `_SHIFT_M`: the shortest shift is three times the distance at which roads agree."""
         return max(1.0, 4.5 * reach_m / _SHIFT_M[0])
 
     def _spiral(self, reach_m: float, n_shifts: int) -> FloatArray:
@@ -269,7 +268,7 @@ class Evidence:
     def _onto_neighbours(
         self, matrix: FloatArray, reach_m: float, within: tuple[float, float, float] | None, n_anchors: int
     ) -> FloatArray:
-        """Return shifts (M, 2) in metres that lay an intersection of the map near the frame's middle on others."""
+        """Return shifts (M, 2), metres, that move a map intersection near the middle of the frame onto others."""
         wider = self._least_shift(reach_m)
         low, high = (wider * end for end in _SHIFT_M)
         middle = Homography(matrix)(self.scene.center)
@@ -287,21 +286,21 @@ class Evidence:
 
 
 def statement_px(gsd_m: float) -> float:
-    """Return how many pixels of road count as one independent statement.
+    """Return the pixels of road that count as one independent statement.
 
-    A likelihood times that compares places of different scale: it is what they explain of the same pixels. By
-    themselves those of larger pixels have more statements to make.
+    Likelihoods times this number compare places of different scale, for both then count the same pixels. Without it a
+    place with larger pixels has more statements.
     """
     return max(STATEMENT_M / gsd_m, STATEMENT_PX)
 
 
 def tolerance_m(gsd_m: float) -> float:
-    """Return how far roads that agree may lie apart: three standard deviations, metres."""
+    """Return the greatest distance of roads that agree, metres: three standard deviations."""
     return 3.0 * math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
 
 
 def match_intersections(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[IntArray, FloatArray]:
-    """Return the map's intersection that each of the query's is (N,), or -1, and metres between them (N,)."""
+    """Return the map intersection matched to each query intersection (N,), or -1, and their distance (N,), metres."""
     found = scene.intersections
     matched, distance = np.empty(len(found), np.int64), np.empty(len(found))
     reach_m = 1.5 * tolerance_m(sampling(matrix, scene.size))
@@ -310,7 +309,7 @@ def match_intersections(matrix: FloatArray, scene: Scene, index: ReferenceIndex)
 
 
 def agreement(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[Agreement, IntArray, FloatArray]:
-    """Return what agrees at a place, and which intersections are matched, and how well (see `match_intersections`)."""
+    """Return the agreement at a place, and its matched intersections and their distances (`match_intersections`)."""
     matched, distance = match_intersections(matrix, scene, index)
     return Evidence(scene, index, sampling(matrix, scene.size)).agreement(matrix, matched), matched, distance
 
@@ -323,16 +322,16 @@ def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 def _anyhow(expected: float) -> int:
-    """Return the share of pieces that have one of the expected number of roads near, as a step of the ladder."""
+    """Return the share of pieces near at least one of the expected number of roads, as a power of `_STEP`."""
     share = 1.0 - math.exp(-expected)
     return min(max(round(math.log(max(share, 1e-9)) / math.log(_STEP)), 0), _STEPS)
 
 
 @lru_cache(maxsize=256)
 def _log_ratios(anyhow: int, blur: float) -> FloatArray:
-    """Return log likelihood ratios (sigma, share, bin) of a residual, against a road that lies there anyhow.
+    """Return log likelihood ratios (sigma, share, bin) of a residual, against a road that lies there by chance.
 
-    Deviations and residuals count usual deviations, and so does the `blur`; the last bin is no road within reach.
+    Deviations, residuals and the `blur` are in usual deviations; the last bin holds roads without a road within reach.
     """
     sigmas = np.hypot(_SIGMAS, blur)[:, None]
     residual = (np.arange(_BINS) + 0.5) * (_REACH / _BINS)
@@ -347,19 +346,19 @@ _OFTENER_THAN_NORMAL = 0.25 / (0.5 * math.erfc(1.0))
 
 
 def log10_lead(difference: FloatArray) -> float:
-    """Log10 odds that one place agrees better than another by more than chance, from their difference in each piece.
+    """Return the log10 lead of a place over another by more than chance, from their difference in each piece.
 
-    Were they alike, each piece of the frame would speak for either with the same probability: the signed ranks of the
-    differences (Wilcoxon, 1945) add up to more than z times the root of the sum of their squares with a probability of
-    at most exp(-z^2 / 2) (Hoeffding), and of at most 3.18 times that of a normal variable; the smaller one counts.
-    Ranks, for a few pieces may differ much where one place lies beside a road, while most differ little.
+    If two places were alike, each piece of the frame would favour either with the same probability. The signed ranks of
+    the differences (Wilcoxon, 1945) then exceed z times the root of the sum of their squares with a probability of at
+    most exp(-z^2 / 2) (Hoeffding), and at most 3.18 times a normal variable's; the smaller bound counts. Ranks are
+    used because a few pieces may differ much, where a place lies beside a road, while most differ little.
     """
-    told = difference[difference != 0.0]
-    if not len(told):
+    unequal = difference[difference != 0.0]
+    if not len(unequal):
         return 0.0
-    _, rank, n_alike = np.unique(np.abs(told), return_inverse=True, return_counts=True)
+    _, rank, n_alike = np.unique(np.abs(unequal), return_inverse=True, return_counts=True)
     ranks = (np.cumsum(n_alike) - 0.5 * (n_alike - 1))[rank]
-    z = float(np.sign(told) @ ranks) / math.sqrt(float(ranks @ ranks))
+    z = float(np.sign(unequal) @ ranks) / math.sqrt(float(ranks @ ranks))
     if z <= 0.0:
         return 0.0
     hoeffding = -0.5 * z**2 / math.log(10.0)

@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,20 +37,20 @@ __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthSt
 
 SCHEMA = "roadgeo.explanation/1"
 
-#: Places that are shown, and those that a camera refused which are looked at again.
+#: Most places that are shown.
 _MAX_PLACES = 6
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
-#: Places that a camera refused which are compared, and proposals of an anchor which hints bar that are grown.
+#: Most refused places that are compared, and most barred proposals of an anchor that are grown.
 _MAX_REFUSED, _MAX_ELSEWHERE = 200, 20
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
-#: How far the middle of a rough proposal may lie from the truth, in halves of the frame's diagonal, and at least.
+#: Distance of a rough proposal's middle from the truth, in halves of the frame's diagonal, and at least in metres.
 _ROUGHLY, _AT_LEAST_M = 0.25, 50.0
-#: Pixels that are greater hardly reach as far as intersections are.
+#: Larger pixels do not extend the distance from the map at which a place counts as off it.
 _LARGE_PIXEL_M = 5.0
 
-#: What is missing where nothing came out of a stage.
+#: Messages for stages without a result.
 _NOTHING = {
     "anchors": "no intersection has three neighbours and tangents that make usable tuples",
     "tuples": "no intersection has three neighbours and tangents that make usable tuples",
@@ -79,7 +80,7 @@ class Funnel:
     tuples: int = 0  # of the mask, looked up
     candidates: int = 0  # tuples of the map like them
     proposals: int = 0  # places on which several agree
-    on_roads: int = 0  # those that put the roads around the anchor on roads
+    on_roads: int = 0  # proposals that put the roads around the anchor on roads
     grown: int = 0  # followed outwards
     survived: int = 0  # not given up on the way
     verified: int = 0  # different ones, refined and compared with the map
@@ -88,7 +89,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class RejectedPlace:
-    """A place that was verified, and why it is not the answer; the answer itself is the first, with that as its `why`.
+    """A verified place, and `why` it is not the answer; the answer itself comes first, and its `why` is that it is one.
 
     Attributes
     ----------
@@ -99,7 +100,7 @@ class RejectedPlace:
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
     nearby : float
-        What the best place nearby explains (log10); 0 where nothing could be compared.
+        Log10 likelihood of the best place nearby; 0 if nothing could be compared.
     """
 
     scored: Scored
@@ -261,8 +262,8 @@ def tell(query: Query, found: Found, options: LocateOptions) -> Story:
     truth = _true_place(query.name, options)
     if truth is None:
         return story
-    told = tell_truth(truth, events, location, options)
-    return replace(story, truth=told, missing=story.missing if told.lost_at is None else (told.said, *story.missing))
+    fate = tell_truth(truth, events, location, options)
+    return replace(story, truth=fate, missing=story.missing if fate.lost_at is None else (fate.said, *story.missing))
 
 
 class _Course:
@@ -282,7 +283,7 @@ class _Course:
         self._look_elsewhere()
         scored = events.of("scored")
         self.refusals = Counter(
-            [fault for fault, _ in events.of("refused")] + [one.fault for one in scored if one.fault]
+            [fault for fault, _ in events.of("refused")] + [entry.fault for entry in scored if entry.fault]
         )
         entries = [*scored, *([] if location.located else self._without_limits())]
         self.places = tuple(map(self._describe, self._distinct(sorted(entries, key=self._rank))))
@@ -297,12 +298,13 @@ class _Course:
                     self.events.note("refused", fault, hypothesis.matrix)
 
     def _without_limits(self) -> list[Scored]:
-        """Verify the best of the places that the camera refused as if it had not."""
+        """Verify the best places that the camera's limits refused, without these limits."""
         scene, index, options = self.search.scene, self.search.index, self.search.options
         camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
         free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=self.search.ledger)
         compared = []
-        for fault, unscaled in [one for one in self.events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
+        negotiable = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
+        for fault, unscaled in islice(negotiable, _MAX_REFUSED):
             matrix = unscaled / unscaled[2, 2]
             found, matched, _ = agreement(matrix, scene, index)
             compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
@@ -310,7 +312,7 @@ class _Course:
         return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_PLACES]]
 
     def _rank(self, entry: Scored) -> tuple[bool, float]:
-        """Sort by odds; places that the camera refused come last, unless that alone kept them from being the answer."""
+        """Sort by score; refused places come last, unless the camera's limits alone kept them from being the answer."""
         return entry.fault is not None and entry.log10_odds < self.needed, -entry.log10_odds
 
     def _distinct(self, entries: Sequence[Scored]) -> list[Scored]:
@@ -324,7 +326,7 @@ class _Course:
         return kept
 
     def _count(self) -> Funnel:
-        """Count what came out of each stage of the search."""
+        """Count the results of each stage of the search."""
         search, events = self.search, self.events
         screened, voted = events.of("screened"), events.of("voted")
         proposed = sum(count for _, count in voted)  # all of them lie on roads
@@ -373,7 +375,7 @@ class _Course:
 
     @property
     def starved(self) -> str:
-        """The first stage that nothing came out of."""
+        """The first stage without a result."""
         stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
         empty = next((stage for stage in stages if getattr(self.funnel, stage) == 0), None)
         if empty is None:
@@ -382,32 +384,32 @@ class _Course:
 
     def missing(self) -> list[str]:
         """List the missing evidence, the surest first."""
-        told, n, starved = [], self.funnel.intersections, self.starved
+        lines, n, starved = [], self.funnel.intersections, self.starved
         if self.result.stopped in ("time", "work"):
-            told.append(f"{self.result.stopped}: the search was stopped by its limit, places may be left untried")
+            lines.append(f"{self.result.stopped}: the search was stopped by its limit, places may be left untried")
         if starved in _NOTHING:
-            told.append(_NOTHING[starved])
+            lines.append(_NOTHING[starved])
         if starved == "camera":
             reasons = ", ".join(f"{fault.value} ({times})" for fault, times in self.refusals.most_common())
-            told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
+            lines.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
         best = self.places[0] if self.places else None
         if best is not None and best.scored.fault is not None and best.scored.log10_odds >= self.needed:
             objection = _objection(best)
-            told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
+            lines.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
         elif best is not None and starved == "odds":
-            told.append(f"evidence: at the best place {_weakest(best)}")
+            lines.append(f"evidence: at the best place {_weakest(best)}")
         if starved == "margin":
-            told.append(
+            lines.append(
                 "difference: another place fits almost as well; more of the surroundings in view would tell them apart"
             )
         if n < _USUAL_INTERSECTIONS:
             few = f"masks with fewer than {_USUAL_INTERSECTIONS} are seldom located"
-            told.append(f"intersections: {n} are seen; {few}")
+            lines.append(f"intersections: {n} are seen; {few}")
         if best is not None and best.nearby > 0.5 * best.scored.model.log10_likelihood > 0.0:
-            told.append("variety: streets here are so alike that a shifted copy explains half as much and more")
+            lines.append("variety: streets here are so alike that a shifted copy explains half as much and more")
         if self.search.near is not None and not self.places:
-            told.append("perhaps the circle given is wrong: nothing outside it was tried")
-        return told or ["agreement: nothing on this map is like the mask; another map may be needed"]
+            lines.append("perhaps the circle given is wrong: nothing outside it was tried")
+        return lines or ["agreement: nothing on this map is like the mask; another map may be needed"]
 
 
 def _finite(value: float) -> float | None:
@@ -443,7 +445,7 @@ def _weakest(place: RejectedPlace) -> str:
 
 
 def _true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
-    """Return longitude and latitude of a mask's true place where that is given."""
+    """Return longitude and latitude of a mask's true place if it is given."""
     for name, lon, lat in options.truths:
         if not name or Path(mask).as_posix().endswith(name):
             return lon, lat
@@ -451,11 +453,11 @@ def _true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None
 
 
 def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, options: LocateOptions) -> TruthStory:
-    """Return which stage lost the truth; `location` is the answer on this reference."""
+    """Describe the stage that lost the true place; `location` is the answer on this reference."""
     if events.estimator is None:
         return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_MET, 0), None)
     there = _TruePlace(events.estimator, lonlat)
-    return there.told(*there.met(events), location, options.min_log10_odds)
+    return there.story(*there.met(events), location, options.min_log10_odds)
 
 
 class _TruePlace:
@@ -466,7 +468,7 @@ class _TruePlace:
         self.xy = np.asarray(from_lonlat(estimator.index.plane, np.array([lonlat]))[0], float)
 
     def met(self, events: Events) -> tuple[dict[str, int], list[CameraFault], float]:
-        """Return how often each stage met it, the camera's objections to it, and the best odds that it reached."""
+        """Return the number of times each stage met it, the camera's objections to it, and its best score."""
         counts, scene, index = dict.fromkeys(_MET, 0), self.estimator.scene, self.estimator.index
         for proposals, _, kept in events.of("screened"):
             linear = proposals.affine.reshape(-1, 2, 2)
@@ -474,12 +476,12 @@ class _TruePlace:
             near = self._is_near(middles, np.sqrt(np.abs(np.linalg.det(linear))))
             counts["proposals"] += int(near.sum())
             counts["on_roads"] += int(near[kept].sum())
-        scored = [one for one in events.of("scored") if self._is_there(one.model.matrix)]
+        scored = [entry for entry in events.of("scored") if self._is_there(entry.model.matrix)]
         faults = [fault for fault, matrix in events.of("refused") if self._is_there(matrix / matrix[2, 2])]
-        faults += [one.fault for one in scored if one.fault is not None]
+        faults += [entry.fault for entry in scored if entry.fault is not None]
         survived = sum(self._is_there(matrix) for grown in events.of("grown") for matrix in grown)
         counts |= {"survived": survived, "camera": len(faults), "verified": len(scored)}
-        return counts, faults, max((one.log10_odds for one in scored), default=-math.inf)
+        return counts, faults, max((entry.log10_odds for entry in scored), default=-math.inf)
 
     def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:
         """Return which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
@@ -492,10 +494,10 @@ class _TruePlace:
         scale = np.array([sampling(matrix, scene.size)])
         return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
 
-    def told(
+    def story(
         self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: float
     ) -> TruthStory:
-        """Return which stage lost it."""
+        """Describe the stage that lost it."""
         estimator = self.estimator
         reach_m = estimator.scene.half_size * min(estimator.options.camera.gsd_m[1], _LARGE_PIXEL_M)
         lost_at: str | None

@@ -35,11 +35,11 @@ __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
 
 #: Where this much of the mask's roads agrees, no cell of the frame was left out; a fit to all cells loses hardly any.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
-#: How far corners are moved, one by one, to see whether the fit comes back: metres in the middle of the frame, and not
-#: less than 8 pixels; by how many road points; and how often at most.
+#: Corners are moved one by one by this distance, to see whether the fit comes back: metres in the middle of the frame,
+#: at least so many pixels; the number of road points of such fits; and the most rounds.
 _BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = 24.0, 8.0, 150, 5
-#: A fit has come back that moves no corner by more than this part of the step. Another one is better where this share
-#: of the road points lies on roads in addition.
+#: A fit has come back if no corner is off by more than this part of the step. Another fit is better if this share of
+#: the road points lies on roads in addition.
 _BACK, _BETTER = 0.125, 0.006
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
@@ -58,7 +58,7 @@ _LEAST_SLOPE = 0.17
 def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: float) -> None:
     """Refine the best place of a map for the last time, and measure how sure its corners are.
 
-    Only one whose `score` may be reported is worth a fit to the whole frame: every part of a map has a best place.
+    A place is fitted to the whole frame only if its `score` may be reported: every part of a map has a best place.
     """
     if best is None or best.refined is None or best.found is None or not estimator.options.lens:
         return
@@ -95,7 +95,7 @@ def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least:
 
 
 def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
-    """Lay the middle of a mask's two roads on the map's one; return the scene with road points there."""
+    """Fit the middle of a mask's two roads to the map's single road; return the scene with road points there."""
     scene, index = estimator.scene, estimator.index
     found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
     if seen is scene or not estimator.may_be(found.matrix):
@@ -105,32 +105,31 @@ def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refi
 
 
 def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined | None:
-    """Find a homography beside a refined one that lays more of the roads on roads; None where there is none.
+    """Find a homography near a refined one that puts more road points on roads; None if there is no better one.
 
-    Each corner of the frame in turn is put elsewhere, the others stay; where the fit does not come back, it may have
-    found something better.
+    Each corner of the frame is moved in turn, while the others stay. A fit that does not come back may be better.
     """
     options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
     places, gsd = Homography(refined.matrix).everywhere(scene.corners), sampling(refined.matrix, scene.size)
     step_m = max(_BESIDE_M, _BESIDE_PX * gsd)
 
-    def stays_away(one: Refined) -> bool:
-        moved = np.hypot(*(Homography(one.matrix).everywhere(scene.corners) - places).T)
+    def stays_away(fit: Refined) -> bool:
+        moved = np.hypot(*(Homography(fit.matrix).everywhere(scene.corners) - places).T)
         return bool(moved.max() > _BACK * step_m)
 
     starts = _beside(refined.matrix, scene, step_m / gsd)
     tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
-    weights = {weight_on_roads(one.matrix, scene, index): one for one in tried if one is not None and stays_away(one)}
+    weights = {weight_on_roads(fit.matrix, scene, index): fit for fit in tried if fit is not None and stays_away(fit)}
     found = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None
     needed = weight_on_roads(refined.matrix, scene, index) + _BETTER * len(scene.points)
     return found if found is not None and weight_on_roads(found.matrix, scene, index) > needed else None
 
 
 def _beside(matrix: FloatArray, scene: Scene, pixels: float) -> list[FloatArray]:
-    """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does.
+    """Return homographies (3, 3) that move one corner of the frame, and map the others as `matrix` does.
 
-    By this many pixels in each corner, and not by less ground than in the middle of the frame: what a steep view shows
-    far away may be off by more.
+    The corner moves by this many pixels, but not by less ground than in the middle of the frame: distant ground of an
+    oblique view may be off by more.
     """
     corners, least_m = scene.corners.astype(np.float32), pixels * sampling(matrix, scene.size)
     places, by_pixel = Homography(matrix).everywhere(scene.corners), Homography(matrix).jacobian(scene.corners)
@@ -148,18 +147,18 @@ def _beside(matrix: FloatArray, scene: Scene, pixels: float) -> list[FloatArray]
 def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined:
     """Return a refined homography with the covariance of its corners by the jackknife.
 
-    Each road, or piece of a long one, is left out in turn, and the scatter of the corners is their covariance (a
-    jackknife of clusters; Bell and McCaffrey 2002). It assumes nothing of how large errors are, how far they keep their
-    sign, or which roads were met wrongly. A corner is as uncertain as the roads on which it depends.
+    Each road, or piece of a long road, is left out in turn, and the scatter of the corners is their covariance (a
+    jackknife of clusters; Bell and McCaffrey 2002). It assumes nothing about the size of errors, their correlation
+    along a road, or wrong matches. A corner is as uncertain as the roads on which it depends.
 
-    The matrix stays as it is, and so does the covariance where too few roads are met.
+    The matrix does not change, nor does the covariance if too few roads are met.
     """
     k1 = refined.lens_k1
     equations = Equations(refined.matrix, scene, index, options, k1 or None)
     which = equations.meet()
     if which.sum() < FEWEST:
         return refined
-    rows, residuals, sigmas, own, _ = (one[which] for one in equations.met)
+    rows, residuals, sigmas, own, _ = (values[which] for values in equations.met)
     cauchy, free = equations.cauchy[which], rows.shape[1]
     weights = equations.weight * cauchy / own**2
     prior = np.diag(equations.prior[:free]) + 1e-9 * np.eye(free)

@@ -45,8 +45,8 @@ __all__ = [
 class Hypothesis:
     """A grown hypothesis and its results.
 
-    `by_roads`: it grew by roads over the whole frame; `log10_likelihood`, `nearby`: that of the place, and that of the
-    best place nearby (see `evidence`), None before it is looked for; `fault`: the camera's last objection, or None.
+    `by_roads`: it grew by roads over the whole frame; `log10_likelihood`: likelihood of the place (see `evidence`);
+    `nearby`: likelihood of the best place nearby, None before the search for it; `fault`: the camera's last objection.
     """
 
     matrix: FloatArray
@@ -64,11 +64,11 @@ class Hypothesis:
 
     @classmethod
     def at(cls, matrix: FloatArray, scene: Scene, index: ReferenceIndex, support: float = 1.0) -> Hypothesis:
-        """Return that of a place that did not grow by intersections, with those that match there."""
+        """Make the hypothesis of a place that did not grow by intersections, with the intersections that match."""
         return cls(matrix, support, match_intersections(matrix, scene, index)[0], by_roads=True)
 
     def lay(self, refined: Refined, scene: Scene, index: ReferenceIndex) -> Hypothesis:
-        """Return it as refined, with what agrees with it, of a scene as a pinhole sees it."""
+        """Return the hypothesis with its refinement and its agreement on a scene without distortion."""
         found, matched, distance = agreement(refined.matrix, scene, index)
         return replace(
             self, matrix=refined.matrix, refined=refined, found=found, matched=matched,
@@ -91,23 +91,24 @@ class Hypothesis:
         return self._spot
 
 
-#: Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
+#: Greatest factor between the ground sampling anywhere in a tilted frame and in its middle.
 MAX_SCALE_RATIO = 2.0
-#: Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
+#: Bounds of an anchor's work: proposals screened, proposals grown, and grown hypotheses scored.
 MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
-#: Of this number of road points near the anchor, this share must lie within these radii of roads: lengths have a
-#: part in metres, the map's, and one in pixels, the mask's.
+#: Number of road points near the anchor, the share of them that must lie near roads, and the radius: the map's part in
+#: metres, and the mask's in pixels.
 _SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, (8.0, 4.0)
-#: Standard deviation of an intersection's place, and the greatest search radius, likewise.
+#: Standard deviation of an intersection's place, and the greatest search radius, each in metres and in pixels.
 _SIGMA, _RADIUS = (3.5, 1.5), (20.0, 5.0)
-#: Of the sequential test: share of intersections that match if true and if not, and the nats lost before it gives up.
+#: Sequential test: share of intersections that match at a right place and at a wrong place, and the nats lost before it
+#: gives up.
 _HIT_RATE, _CHANCE_RATE, _PATIENCE = 0.45, 0.08, 6.0
-#: Least matches besides the seeds; of more intersections, those nearest to the anchor decide how well one grows.
+#: Least matches besides the seeds; most intersections of a growth, the nearest to the anchor.
 _MIN_MATCHED, _MAX_POINTS = 2, 1000
 
 
 def screen_proposals(scene: Scene, index: ReferenceIndex, proposals: Proposals, looked_at: IntArray) -> IntArray:
-    """Return those of the proposals `looked_at` that put roads around the anchor on roads of the map, best first."""
+    """Return the proposals among `looked_at` that put roads around the anchor on roads of the map, best first."""
     if len(looked_at) == 0:
         return looked_at
     anchor = scene.intersections.xy[proposals.anchor]
@@ -134,10 +135,10 @@ def grow_proposals(
     chosen: IntArray,
     camera: CameraOptions,
 ) -> list[Hypothesis]:
-    """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
+    """Grow the chosen proposals of an anchor; return those that were not given up, the best supported first."""
     if len(chosen) == 0:
         return []
-    # The query: intersections outwards from the anchor, and which of its neighbours each proposal is made of.
+    # The query: intersections outwards from the anchor, and the neighbours on which each proposal is based.
     xy, anchor = scene.intersections.xy, proposals.anchor
     order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[:_MAX_POINTS]
     partners = np.ascontiguousarray(proposals.partners[chosen])
@@ -156,7 +157,7 @@ def grow_proposals(
     return [Hypothesis(matrices[m] / matrices[m, 2, 2], float(ratios[m]), matched[m]) for m in best]
 
 
-#: Whether hypotheses on two parts are one place of one map, which is cut into overlapping pieces.
+#: Whether hypotheses on two parts are the same place of a map that is cut into overlapping pieces.
 SamePlace: TypeAlias = "Callable[[TripleEstimator, Hypothesis, TripleEstimator, Hypothesis], bool]"
 
 
@@ -165,7 +166,7 @@ _Grown: TypeAlias = "dict[int, list[Hypothesis]]"
 
 
 class SharedSweeps:
-    """The sweeps of the parts of one search; each part takes from them what concerns it.
+    """The sweeps shared by the parts of a search; each part takes its own places from them.
 
     Attributes
     ----------
@@ -188,7 +189,7 @@ class SharedSweeps:
         self._turnouts: dict[float, Turnout] = {}
 
     def rounds(self, member: TripleEstimator, sweep: Sweep) -> Iterator[list[Hypothesis]]:
-        """Yield places that grew on a part from the proposals of one anchor after another, until enough were seen."""
+        """Yield the places that grew on a part from each anchor's proposals, until enough were screened."""
         rounds = self._rounds.setdefault(id(sweep), self._work(sweep))
         done = self._done.setdefault(id(sweep), [])
         n = 0
@@ -224,20 +225,20 @@ class SharedSweeps:
             yield self._grow(proposals)
 
     def _grow(self, proposals: Sequence[Proposals]) -> _Grown:
-        """Follow one anchor's proposals on all parts; return the best places that grew, by the part's identity."""
+        """Grow an anchor's proposals on all parts; return the best places that grew, by the part's identity."""
         members = self.members
         # The best placed are screened ...
-        allowed = [member.allow(one) for member, one in zip(members, proposals, strict=True)]
-        placed = [one.placed[may] for one, may in zip(proposals, allowed, strict=True)]
+        allowed = [member.allow(own) for member, own in zip(members, proposals, strict=True)]
+        placed = [own.placed[may] for own, may in zip(proposals, allowed, strict=True)]
         kept = [
-            member.screen(one, may, most)
-            for member, one, may, most in zip(members, proposals, allowed, _best(placed, MAX_SCREENED), strict=True)
+            member.screen(own, may, most)
+            for member, own, may, most in zip(members, proposals, allowed, _best(placed, MAX_SCREENED), strict=True)
         ]
         # ... an even share of those that lie on roads grows ...
         share = min(MAX_GROWN / max(sum(map(len, kept)), 1), 1.0)
         grown = [
-            _owned(member, member.follow_up(one, rows[: math.ceil(share * len(rows))]))
-            for member, one, rows in zip(members, proposals, kept, strict=True)
+            _owned(member, member.follow_up(own, rows[: math.ceil(share * len(rows))]))
+            for member, own, rows in zip(members, proposals, kept, strict=True)
             if len(rows)
         ]
         # ... and the best of these are verified.
@@ -247,17 +248,18 @@ class SharedSweeps:
                 best.append((member, hypothesis))
                 if len(best) == MAX_VERIFIED:
                     break
-        return {id(member): [one for owner, one in best if owner is member] for member, _ in best}
+        return {id(member): [place for owner, place in best if owner is member] for member, _ in best}
 
     def _is_met(
         self, member: TripleEstimator, hypothesis: Hypothesis, best: Sequence[tuple[TripleEstimator, Hypothesis]]
     ) -> bool:
-        """Whether another part that overlaps this one has the same place."""
+        """Return whether another part that overlaps this one has the same place."""
         if self.same_place is None:
             return False
-        known = [(other, one) for other in self.members for one in other.known_places()]
+        known = [(other, place) for other in self.members for place in other.known_places()]
         return any(
-            other is not member and self.same_place(member, hypothesis, other, one) for other, one in (*best, *known)
+            other is not member and self.same_place(member, hypothesis, other, place)
+            for other, place in (*best, *known)
         )
 
 
@@ -269,13 +271,13 @@ def _owned(member: TripleEstimator, grown: Iterator[Hypothesis]) -> Iterator[tup
 def _best(placed: Sequence[IntArray], most: int) -> IntArray:
     """Return how many of each part's proposals, the best placed first, are among the best `most` of all.
 
-    Of equals each part gives one in turn.
+    Parts take turns where proposals are equal.
     """
-    counts = np.array([len(one) for one in placed])
+    counts = np.array([len(own) for own in placed])
     if counts.sum() <= most:
         return counts
     owners = np.repeat(np.arange(len(placed)), counts)
     all_placed = np.concatenate(placed)
-    turns = np.concatenate([np.arange(len(one)) - np.searchsorted(-one, -one) for one in placed])
+    turns = np.concatenate([np.arange(len(own)) - np.searchsorted(-own, -own) for own in placed])
     chosen = np.lexsort((turns, -all_placed))[:most]
     return np.bincount(owners[chosen], minlength=len(placed))

@@ -1,4 +1,4 @@
-"""Hints on an image: one table, by which the command line, HTTP, QGIS and Python read them alike.
+"""Hints on an image: a single table for the command line, HTTP, QGIS and Python.
 
 A value is a number, several numbers, or a text such as "0.3", "0.3:0.6", "90+-10" or "-71.06,42.36,5000".
 """
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 __all__ = ["HINTS", "Hint", "apply_hints", "read_box", "read_hint", "read_numbers", "read_place", "read_range"]
 
-#: One pixel size stands for a range from it divided by this to it times this: sizes are seldom known better.
+#: A single pixel size stands for the range from size / factor to size * factor: sizes are seldom known better.
 _GSD_FACTOR = 1.25
-#: Tolerance of a heading without one, degrees.
+#: Tolerance of a heading that is given without a tolerance, degrees.
 _HEADING_OFF_DEG = 10.0
 
 
 @dataclass(frozen=True)
 class Hint:
-    """One thing that may be known.
+    """A fact that a user may know about an image.
 
-    `read` takes a value in any form, and returns what the search takes; it raises ValueError: "got ..., expected ...".
+    `read` turns a value in any form into the option's value; it raises ValueError: "got ..., expected ...".
     """
 
     name: str  # as a keyword of Python; `option` is its name on the command line, `parameter` over HTTP
@@ -38,8 +38,8 @@ class Hint:
     help: str  # its meaning, with its unit and its default
     read: Callable[[Any], Any]
     schema: Mapping[str, Any]  # JSON Schema of a value over HTTP, next to a text
-    default: float | str = ""  # where none is given, as far as one word tells it; `told` adds it to the help
-    group: str = "The image"  # the heading of the help that it stands under
+    default: float | str = ""  # if it fits in a word; `told` adds it to the help
+    group: str = "The image"  # its heading in the help
     also: str = ""  # an earlier name of the option
 
     @property
@@ -50,8 +50,8 @@ class Hint:
     @property
     def told(self) -> str:
         """The help with the default."""
-        told = self.default == "" or "default" in self.help
-        return self.help if told else f"{self.help} Default: {self.default}."
+        is_complete = self.default == "" or "default" in self.help
+        return self.help if is_complete else f"{self.help} Default: {self.default}."
 
     @property
     def parameter(self) -> str:
@@ -70,7 +70,7 @@ def _expect(holds: bool, value: Any, form: str, why: str = "") -> None:
 
 
 def read_numbers(value: Any, form: str, counts: Sequence[int], separators: str = ",:") -> tuple[float, ...]:
-    """Return the finite numbers that a value holds, as many as one of `counts`."""
+    """Return the finite numbers in a value; their number must be among `counts`."""
     if isinstance(value, str):
         parts: Sequence[Any] = re.split(f"[{separators}]", value)
     else:
@@ -98,7 +98,7 @@ def _split_tolerance(value: Any) -> tuple[Any, str]:
 
 
 def read_range(value: Any, form: str = "a number above 0, or LO:HI") -> tuple[float, float]:
-    """Return two numbers above 0, the second not below the first; one number stands for both."""
+    """Return two numbers above 0, the second not below the first; a single number stands for both."""
     low, high = (read_numbers(value, form, (1, 2)) * 2)[:2]
     _expect(0 < low <= high, value, form, "LO must be above 0 and not above HI")
     return low, high
@@ -256,7 +256,7 @@ def read_hint(name: str, value: Any) -> tuple[str, Any]:
 
 
 def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptions:
-    """Put what is known in its place among the options of all stages; the rest stays as it is.
+    """Set the options of all stages from the hints that are known; other options stay unchanged.
 
     Parameters
     ----------

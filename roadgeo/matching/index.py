@@ -1,7 +1,7 @@
 """The reference index: everything `locate` needs of a road network, in flat arrays that can be memory-mapped.
 
-Intersections are stored sorted by bucket of one grid, which also lists the road segments; the table of triple codes
-(`kernels.triple_codes`) points into them. Positions are metres from the plane's origin.
+Intersections are sorted by the bucket of a grid, which also lists the road segments. The table of triple codes
+(`kernels.triple_codes`) points to intersections. Positions are metres from the plane's origin.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = [
     "unpack_tangents",
 ]
 
-#: Factor by which buckets of roads are narrower than those of intersections: roads are looked up some 20 m around.
+#: Factor by which the roads' buckets are narrower than the intersections': roads are looked up within some 20 m.
 _FINER = 2
 
 #: Limits of an index from a stranger: the kernels sample segments every few metres, in each bucket that lists them.
@@ -78,7 +78,7 @@ class IndexOptions:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceIndex:
-    """A searchable reference; equal to itself only, so that what is made of it can be cached.
+    """A searchable reference; equal only to itself, so that values derived from it can be cached.
 
     Dimensions: N intersections, R ray columns, K neighbours, S segments, B buckets, T table entries.
 
@@ -141,7 +141,7 @@ class ReferenceIndex:
 
     @cached_property
     def coarseness(self) -> float:
-        """How many times as far as on an ordinary map roads were merged: 1, or that of a coarse map."""
+        """Ratio of the distance within which roads were merged to an ordinary map's: 1, or more for a coarse map."""
         merged_m: Any = self.meta
         for key in ("options", "simplify", "merge_radius"):
             merged_m = merged_m.get(key) if isinstance(merged_m, Mapping) else None
@@ -217,7 +217,7 @@ class ReferenceIndex:
         return cls(meta=meta, path=path, **{name: arrays[name] for name in _SCHEMA})
 
 
-#: Types of the arrays, and their shapes: letters are dimensions, of one size wherever they occur.
+#: Types of the arrays, and their shapes: a letter is a dimension, with the same size wherever it occurs.
 _SCHEMA: dict[str, tuple[str, str]] = {
     "xy": ("<f8", "N 2"),
     "branches": ("|i1", "N R 2"),
@@ -262,7 +262,7 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     require(type(columns) is type(rows) is int and min(columns, rows) > 0 and columns * rows < 2**31, "bad shape")
     require(isinstance(meta.get("crs"), str), "no CRS")
     require(n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
-    # Where parts of other arrays begin, and what numbers point to.
+    # Arrays of starts must cover the arrays that they divide, and numbers must point into their arrays.
     n_buckets = columns * rows
     n_road_buckets = n_buckets if sizes["C"] == n_buckets + 1 else _FINER**2 * n_buckets
     for starts, total, size in (
@@ -393,8 +393,8 @@ def _place_in_table(cells: Int32Array, entries: AnyArray) -> Int32Array:
 def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
     """Return a reference with the intersections within a circle only; all roads stay.
 
-    Neighbours and triples are those of the intersections left, so that a small part of a large map is searched as
-    quickly and as thoroughly as a small map.
+    Neighbours and triples are built anew from the remaining intersections, so a small part of a large map is searched
+    as quickly and as thoroughly as a small map.
     """
     (kept,) = np.nonzero(np.hypot(*(index.xy - center).T) <= radius_m)
     n_buckets = len(index.point_starts) - 1
@@ -484,5 +484,5 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         **of_points,
     )
     for array in index.arrays().values():
-        array.setflags(write=False)  # as in one opened from a file, so that kernels are compiled once for both
+        array.setflags(write=False)  # as in an index opened from a file: kernels are compiled once for both
     return index

@@ -1,4 +1,4 @@
-"""A lens behind a fit: one parameter of radial distortion, estimated together with the homography where it pays."""
+"""Lens distortion: a single radial parameter, estimated together with the homography where it improves the fit."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 _CORE, _N_HELD = (10, 0.75), 50
 #: Road points that a fit needs.
 FEWEST = 12
-#: As of `RefineOptions`, while a fit grows. Twice as far each point meets some road, and a part of the frame that meets
-#: wrong ones bends the fit over the others.
+#: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the frame
+#: that meets wrong roads bends the whole fit.
 _MAX_RADIUS = (10.0, 5.0)
 #: Values of k1 to begin with in turn, until one explains enough.
 _STARTS = (0.0, -0.15, -0.08, 0.08)
-#: A fit that has met less than this share of the road points is dropped.
+#: A fit that meets less than this share of the road points is dropped.
 _HOPELESS = 0.3
 
 
 def find_lens(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> Refined | None:
-    """Fit a lens where it pays: None where the roads do not show one."""
+    """Fit a lens; return None if the roads show no distortion."""
     best = None
     for start in _STARTS:
         found = fit_lens(matrix, scene, index, refinement, start=start)
@@ -57,15 +57,15 @@ def find_lens(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinemen
     if best is None or _moves_px(best, scene) < 0.5 * _LEAST_PX:
         return None
     found = fit_lens(best.matrix, scene, index, refinement, best.lens_k1)
-    if found is None or abs(found.lens_k1) < _SIGNIFICANCE * found.k1_sigma:  # that of a pinhole finds some k1, too
+    if found is None or abs(found.lens_k1) < _SIGNIFICANCE * found.k1_sigma:  # a pinhole's image yields some k1, too
         return None
     return found if _moves_px(found, scene) >= _LEAST_PX else None
 
 
 def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> Refined | None:
-    """Grow a homography anew from the part of the frame that it lays on roads, without a lens.
+    """Grow a homography anew from the part of the frame that it fits to roads, without a lens.
 
-    It may have settled where only that part agrees. None where hardly more of the roads come to lie on roads.
+    A fit may have settled where only that part agrees. Returns None if hardly more of the road points lie on roads.
     """
     before = Equations(matrix, scene, index, refinement).meet().mean()
     found = fit_lens(matrix, scene, index, refinement, None)
@@ -80,10 +80,10 @@ def fit_lens(
     k1: float | None = 0.0,
     start: float | None = None,
 ) -> Refined | None:
-    """Adjust a homography and k1 to the roads of the map; None where that fails.
+    """Adjust a homography and k1 to the roads of the map; return None if the adjustment fails.
 
-    It begins with the part of the frame that the homography lays on roads, and grows from there: points further out
-    take part when nearer ones fix their places, and the certainty of each follows from the fit.
+    The fit begins with the part of the frame that the homography fits to roads, and grows outwards: a point takes part
+    once nearer points fix its place, and its uncertainty follows from the fit.
 
     Parameters
     ----------
@@ -113,18 +113,18 @@ def fit_lens(
 
 
 def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArray:
-    """Return which points (S,) of those that met roads lie in the part of a frame where most did.
+    """Return which points (S,) that met roads lie in the connected part of the frame with most such points.
 
-    It is made of cells in which nearly as great a share did as in the best one, and is the part with most such points:
-    a small one may meet roads by chance.
+    The part consists of cells in which the share of points that met roads is nearly as great as in the best cell. A
+    small part may meet roads by chance.
     """
     n, least = _CORE
     column, row = np.clip((points / size * (n, -n)).astype(int), 0, n - 1).T
     counts = np.zeros((2, n, n))
     np.add.at(counts[0], (row, column), met)
     np.add.at(counts[1], (row, column), 1.0)
-    # A cell is judged together with its neighbours: alone it has a few points.
-    hits, all_points = (9.0 * cv2.blur(one, (3, 3), borderType=cv2.BORDER_CONSTANT) for one in counts)
+    # A cell is judged together with its neighbours: alone it has few points.
+    hits, all_points = (9.0 * cv2.blur(count, (3, 3), borderType=cv2.BORDER_CONSTANT) for count in counts)
     shares = hits / np.maximum(all_points, FEWEST)
     good = shares >= least * shares.max()
     part = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)[1][row, column]

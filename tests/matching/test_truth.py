@@ -34,7 +34,7 @@ def lonlat(x, y):
 
 def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
     faults = [CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else []
-    return _TruePlace(estimator, lonlat(*at)).told(dict(Counter(met)), faults, best, answer, 3.0)
+    return _TruePlace(estimator, lonlat(*at)).story(dict(Counter(met)), faults, best, answer, 3.0)
 
 
 @pytest.mark.parametrize(
