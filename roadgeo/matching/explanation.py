@@ -37,7 +37,7 @@ __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthSt
 
 SCHEMA = "roadgeo.explanation/1"
 
-#: Most places that are shown.
+#: Most places that are shown, and most refused places that are verified without limits.
 _MAX_PLACES = 6
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
@@ -89,7 +89,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class RejectedPlace:
-    """A verified place, and `why` it is not the answer; the answer itself comes first, and its `why` is that it is one.
+    """A verified place, and `why` it is not the answer; the answer itself comes first, and its `why` states that.
 
     Attributes
     ----------

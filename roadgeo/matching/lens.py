@@ -36,8 +36,8 @@ _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 _CORE, _N_HELD = (10, 0.75), 50
 #: Road points that a fit needs.
 FEWEST = 12
-#: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the frame
-#: that meets wrong roads bends the whole fit.
+#: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the
+#: frame that meets wrong roads bends the whole fit.
 _MAX_RADIUS = (10.0, 5.0)
 #: Values of k1 to begin with in turn, until one explains enough.
 _STARTS = (0.0, -0.15, -0.08, 0.08)

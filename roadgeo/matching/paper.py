@@ -50,16 +50,16 @@ _MAX_TUPLES = 30_000_000
 _LAMBDA = 0.01
 #: Least angle between a tangent and the connecting line, degrees (eq. 7).
 _LEAST_ANGLE_DEG = 15.0
-#: Of larger queries, this many intersections at random form the tuples; all of them still judge.
+#: Most intersections of a query that form tuples, chosen at random; all intersections still judge hypotheses.
 _MAX_TUPLE_INTERSECTIONS = 1000
 #: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
-#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`), and are looked at in such steps; roads
-#: further off, or turned from the branch by more, are others.
+#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`) and are sampled every `_STEP_M`. Roads
+#: further off than `_REACH_M`, or turned from the branch by more, are other roads.
 _LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M = 15.0, 0.5, 8.0, 3.0, 6.0
 #: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
 _TESTS_PER_CALL = 5_000_000
-#: Seconds of a usual machine, on masks of Liège: of a query tuple, of a candidate, and of an intersection by which a
-#: hypothesis is judged, which is given up as soon as too many miss.
+#: Seconds of a usual machine, on masks of Liège: for a query tuple, for a candidate, and for an intersection that
+#: judges a hypothesis. A hypothesis is given up as soon as too many intersections miss.
 _SAMPLE_S, _TESTED_S, _COUNTED_S = 0.35e-3, 0.1e-6, 0.04e-6
 
 
@@ -74,8 +74,8 @@ class PairOptions:
     delta_cross_ratio : float
         Relative error allowed in every cross ratio (eq. 6).
     tangent_orders : {"++", "all"}
-        Correspondences of the tangents tried (section 3.2): both ends in the same rotational sense, the only physical
-        one, with w > 0 all over the frame; or all four, anything going.
+        Correspondences of the tangents tried (section 3.2). "++": both ends in the same rotational sense, the only
+        physical case, with w > 0 all over the frame; "all": all four, without restriction.
     lambda_1 : float
         Greatest probability to miss a tuple's counterpart that is there (eq. 14).
     p_query : float
@@ -83,7 +83,7 @@ class PairOptions:
     delta_inlier : float
         Inlier ratio above which a place is found.
     inlier_distance_m : float
-        How close to an intersection of the same type a mapped one must come (eq. 10).
+        Greatest distance of a mapped intersection from one of the same type that it matches (eq. 10).
     one_to_one : bool
         Let each reference intersection match once only. False: eq. 10 to the letter.
     min_intersections : int
@@ -127,7 +127,7 @@ class PairIndex:
     codes : (N,) int64
         Types of the intersections, 16 N_B + N_q.
     tuples : mapping of int to Tuples
-        By type, 256 times the code of the first end and that of the second; the first is never the greater.
+        Keys are 256 times the code of the first end plus the code of the second end; the first is never the greater.
     """
 
     reference: Intersections
@@ -137,13 +137,13 @@ class PairIndex:
 
     def __len__(self) -> int:
         """Return the number of all tuples."""
-        return sum(len(one.pairs) for one in self.tuples.values())
+        return sum(len(tuples.pairs) for tuples in self.tuples.values())
 
 
 def build_pair_index(intersections: Intersections, options: PairOptions | None = None) -> PairIndex:
     """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
 
-    Of the options `d_max_m` matters.
+    Only the option `d_max_m` matters.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def list_pairs(found: Intersections, chosen: IntArray, d_max: float) -> IntArray
     passes = (dx != 0.0) | (dy != 0.0)
     for ends in pairs.T:
         passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
-        # NaN: there is none
+        # NaN: no tangent
         passes &= ~(np.abs(np.sin(found.tangents[ends] - phi[:, None])) <= least).any(axis=1)
     pairs, codes = np.sort(pairs[passes], axis=1), type_codes(found)
     swapped = codes[pairs[:, 0]] > codes[pairs[:, 1]]
@@ -212,7 +212,7 @@ def type_keys(codes: IntArray, pairs: IntArray) -> IntArray:
 
 
 def cotangents(found: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
-    """Return the (P, N_q) cotangents, falling, of the tangents of `ends` (P,), all of one N_q, relative to lines."""
+    """Return the (P, N_q) falling cotangents of the tangents of `ends` (P,), all with N_q, relative to the lines."""
     tangents = found.tangents[ends, : int(found.n_tangents[ends[0]])].astype(float)
     return np.asarray(-np.sort(-1.0 / np.tan(tangents - np.arctan2(dy, dx)[:, None]), axis=1))
 
@@ -237,7 +237,7 @@ def _fours(n: int) -> tuple[IntArray, IntArray]:
 
 
 def well_fitted(index: ReferenceIndex) -> BoolArray:
-    """Return which intersections (N,) have branches that are all long and straight enough (section 4.2)."""
+    """Return which intersections (N,) have only branches that are long and straight enough (section 4.2)."""
     vectors = index.branches.astype(float) / 127.0
     at, column = np.nonzero(vectors.any(axis=2))
     ahead = vectors[at, column]
@@ -278,7 +278,7 @@ class PairMatch:
     confidence : float
         Probability that the search, as far as it got, finds a place that is there: 1 - P_fail-sum (eq. 12).
     stopped : str
-        Why the search ended: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
+        Why the search ended: "accepted", "exhausted", or a limit, "work" or "time"; "" without a search.
     work_s : float
         The work done, in seconds of a usual machine.
     """
@@ -320,7 +320,7 @@ def match_pairs(
     frame : (4, 2) float64
         The image's corners in the query plane.
     seed : int
-        Of the random draws.
+        Seed of the random draws.
     """
     options = options or PairOptions()
     search = _Search(query, index, np.asarray(frame, float), options, np.random.default_rng(seed))
@@ -347,7 +347,7 @@ class _Correspondence(NamedTuple):
     ends : (2,) int64
         Query intersections that become P1 and P2.
     cotangents : two (N_q,) arrays
-        Of their tangents, relative to the connecting line, in the order in which they correspond.
+        Cotangents of their tangents, relative to the connecting line, in the order in which they correspond.
     candidates : (C, 2) int64
         Reference tuples with like cross ratios.
     """
@@ -430,24 +430,24 @@ class _Search:
     def test(self, a: int, b: int, key: int) -> None:
         """Draw candidates for the query tuple (a, b) of type `key` and test them, within the limits."""
         correspondences = self.correspondences(a, b, key)
-        n_match = sum(len(one.candidates) for one in correspondences)
+        n_match = sum(len(correspondence.candidates) for correspondence in correspondences)
         k = reference_draws(n_match, self.options.lambda_1)
         tested = 0
-        for one in correspondences:
-            n = len(one.candidates)
-            tested += self._test(one, min(n, math.ceil(k * n / max(n_match, 1))))
+        for correspondence in correspondences:
+            n = len(correspondence.candidates)
+            tested += self._test(correspondence, min(n, math.ceil(k * n / max(n_match, 1))))
         self.n_samples += 1
         self.candidates += n_match
         self.log_p_fail += math.log1p(-self.options.p_query * (tested / n_match if n_match else 1.0))
 
-    def _test(self, one: _Correspondence, n_draws: int) -> int:
+    def _test(self, correspondence: _Correspondence, n_draws: int) -> int:
         """Test `n_draws` candidates in random order; return how many the limits allowed."""
-        drawn, done = self.rng.permutation(len(one.candidates))[:n_draws], 0
-        # The kernel comes back now and then, for a look at the limits.
+        drawn, done = self.rng.permutation(len(correspondence.candidates))[:n_draws], 0
+        # The kernel returns now and then, so that the limits are checked.
         per_call = max(1, _TESTS_PER_CALL // len(self.query))
         while done < n_draws and not self.spent:
-            some = one.candidates[drawn[done : done + per_call]]
-            models = self.models(one, some)
+            some = correspondence.candidates[drawn[done : done + per_call]]
+            models = self.models(correspondence, some)
             self.best, row = self.count(models, self.best)
             if row >= 0:
                 self.homography = models[row]
@@ -456,19 +456,19 @@ class _Search:
             done += len(some)
         return done
 
-    def models(self, one: _Correspondence, candidates: IntArray) -> FloatArray:
-        """Return (H, 3, 3), the homographies of candidates from all lines in closed form (eq. 9), as a camera may see.
+    def models(self, correspondence: _Correspondence, candidates: IntArray) -> FloatArray:
+        """Return (H, 3, 3), the possible homographies of candidates from all lines in closed form (eq. 9).
 
         Both planes are taken to frames where P1 = (0, 0) and P2 = (1, 0): a normalisation under which every homography
         that keeps the connecting line is ``[[a1, b1, 0], [0, 1, 0], [a1 - a2, b1 - b2, a2]]``, and eq. 9 falls apart
         into one linear equation cot r' = a_i cot r + b_i for each tangent at P_i. It is not mirrored and has no horizon
         between the two ends just if a1, a2 > 0.
         """
-        reference, (first, second) = self.index.reference, self.query.xy[one.ends]
+        reference, (first, second) = self.index.reference, self.query.xy[correspondence.ends]
         step = (reference.xy[candidates[:, 1]] - reference.xy[candidates[:, 0]]).T
         (a1, b1), (a2, b2) = (
             fit_pencils(cot, cotangents(reference, ends, *step))
-            for cot, ends in zip(one.cotangents, candidates.T, strict=True)
+            for cot, ends in zip(correspondence.cotangents, candidates.T, strict=True)
         )
         zero, unit = np.zeros_like(a1), np.ones_like(a1)
         between = _stacked([[a1, b1, zero], [zero, unit, zero], [a1 - a2, b1 - b2, a2]])

@@ -25,17 +25,17 @@ _DEGREE_M = 110_500.0
 
 
 class Part(Protocol):
-    """A map, or a piece of one, that is searched together with others."""
+    """A map, or a piece of a map, that is searched together with others."""
 
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
-        """Whether a frame of that size at most, whose middle lies within a circle, may show it; it is not opened."""
+        """Return whether a frame of at most this size, its middle in a circle, may show the part; opens nothing."""
 
     def touches(self, box: Box) -> bool:
         """Whether the middle of a frame that it shows may lie in a box; it is not opened."""
 
     @property
     def coarseness(self) -> float:
-        """That of its index, which is not opened."""
+        """Coarseness of the index, which is not opened."""
 
     def open(self) -> ReferenceIndex:
         """Return its index."""
@@ -43,7 +43,7 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class Whole:
-    """A reference of one piece, which is open already."""
+    """A reference in one piece, which is open already."""
 
     index: ReferenceIndex
 
@@ -62,7 +62,7 @@ class Whole:
 
     @property
     def coarseness(self) -> float:
-        """That of its index."""
+        """Coarseness of the index."""
         return self.index.coarseness
 
     def open(self) -> ReferenceIndex:
@@ -82,14 +82,14 @@ def touches(box: tuple[float, float, float, float], near: Near) -> bool:
     return any(west - beyond <= lon + turn <= east + beyond for turn in (-360.0, 0.0, 360.0))
 
 
-def same_within_m(one: ReferenceIndex, other: ReferenceIndex, matrix: FloatArray, size: tuple[int, int]) -> float:
-    """Return how far apart two places may lie on two parts and still be one.
+def same_within_m(first: ReferenceIndex, other: ReferenceIndex, matrix: FloatArray, size: tuple[int, int]) -> float:
+    """Return the greatest distance, metres, at which places on two parts are the same place.
 
-    Shards of one map agree as well as a map with itself: as in `TripleEstimator.same`. Other maps may differ a little,
-    and a place on one of them is taken for that on the other within half a frame.
+    Shards of a map agree as well as a map with itself, as in `TripleEstimator.same`. Different maps may differ a
+    little: there, places within half a frame are the same.
     """
     gsd_m = sampling(matrix, size)
-    shard_of = one.meta.get("shard_of")
+    shard_of = first.meta.get("shard_of")
     if shard_of and shard_of == other.meta.get("shard_of"):
         return Frame(*size).one_place_m(gsd_m)
     return 0.5 * gsd_m * max(size)

@@ -93,14 +93,14 @@ class Refined:
     corner_sigma_m : (4,) float64
         Standard deviations of the frame's corners: root mean squares of their distances from the truth.
     rms_m : float
-        Of the road points' distances from the map's roads, robustly.
+        Robust root mean square of the road points' distances from the map's roads, metres.
     corner_covariance_m2 : (8, 8) float64
-        Of the corners' x and y, in the order x, y of the first, x, y of the second, and so on.
+        Covariance of the corners' x and y, in the order x, y of the first, x, y of the second, and so on.
     lens_k1, k1_sigma : float
-        Of the lens behind which the query plane is that of a pinhole (see `geometry.lens`), and its standard
-        deviation; 0 without one.
+        Radial distortion whose removal makes the query plane a pinhole's (see `geometry.lens`), and its standard
+        deviation; 0 without a lens.
     share : float
-        Part of the road points that lies on roads.
+        Share of the road points that lie on roads.
     """
 
     matrix: FloatArray
@@ -136,7 +136,7 @@ def denormalise(p: FloatArray, center: FloatArray, half_size: float, origin: Flo
 
 
 class Equations:
-    """Road points of a scene on one map, as a camera and its lens see them from about where a homography puts it.
+    """Least-squares equations of a scene's road points on a map, for a homography and a lens.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class Equations:
     unit : float
         Metres per normalised unit of the reference plane.
     weight : float
-        Of a road point against an independent observation of standard deviation `sigma_m` in the middle of the frame.
+        Weight of a road point, relative to an independent observation of `sigma_m` in the middle of the frame.
     prior : (9,) float64
         Weights that hold parameters near zero.
     met : Met
@@ -161,7 +161,7 @@ class Equations:
         k1: float | None = None,
         step: int = 1,
     ) -> None:
-        """Each `step`-th road point takes part. Without a `k1` the camera is a pinhole, and stays one."""
+        """Use each `step`-th road point. Without a `k1` the camera stays a pinhole."""
         self.scene, self.options, self.roads = scene, options, index.road_buckets
         p, self._origin, self.unit = normalise(matrix, scene.center, scene.half_size)
         self.p, free = np.array([*p, k1 or 0.0]), 8 if k1 is None else 9
@@ -203,7 +203,7 @@ class Equations:
         return PointPairs(query, (places - self._origin) / self.unit, _cells(query), weight)
 
     def meet(self) -> BoolArray:
-        """Find the roads near all points, and return which points (S,) met one."""
+        """Find the roads near all points; return which points (S,) met a road."""
         n = self.met.rows.shape[1]
         meet_roads(self.p, self._plane, self.samples, self._limits, self.roads, np.zeros((n, n)), self.met)
         return np.isfinite(self.met.residuals)
@@ -214,7 +214,7 @@ class Equations:
         return np.asarray(1.0 / (1.0 + (self.met.residuals / self.met.sigmas) ** 2))
 
     def adjust(self, pairs: PointPairs, held: Held) -> Refined | None:
-        """Fit the parameters to roads and to points (see `kernels.adjustment.adjust`); None where that fails."""
+        """Fit the parameters to roads and points (see `kernels.adjustment.adjust`); return None if the fit fails."""
         n = self.met.rows.shape[1]
         normal = np.empty((n, n))
         used, rms = adjust(self.p, self._plane, self.samples, pairs, held, self._limits, self.roads, normal, self.met)
@@ -232,7 +232,7 @@ class Equations:
         return Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1, k1_sigma, share)
 
     def corner_covariance(self, covariance: FloatArray) -> FloatArray:
-        """Return the covariance (8, 8) of the frame's corners, square metres, from that of the homography (8, 8)."""
+        """Return the covariance (8, 8) of the frame's corners, square metres, from the homography's (8, 8)."""
         derivatives = self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
         floor = _SIGMA_FLOOR[0] ** 2 + (_SIGMA_FLOOR[1] * self.gsd) ** 2
         return np.asarray(derivatives @ covariance @ derivatives.T * self.unit**2 + 0.5 * floor * np.eye(8))
@@ -280,7 +280,7 @@ def refine(
     n_points: int | None = None,
     held: bool = False,
 ) -> Refined | None:
-    """Adjust a homography by Gauss-Newton with Cauchy weights; None where that fails.
+    """Adjust a homography by Gauss-Newton with Cauchy weights; return None if the adjustment fails.
 
     Parameters
     ----------
@@ -308,16 +308,15 @@ def refine(
 
 # --- carriageways -----------------------------------------------------------------------------------------------------
 #
-# Where a mask shows two roads, and the map has one between them, either is as near to the map's road as the other. A
-# fit that lays one on it is off by half of how far they are apart, and surer than it should be; so their middle is
-# laid there.
+# Where a mask shows two roads and the map a single road between them, both are equally near to the map's road. A fit to
+# either is off by half their distance, with too small a standard deviation. So their middle line is fitted.
 
-#: Roads at these distances, metres, may be one on the map, if it has one for both: nearest points, seen from the two,
-#: that lie within this part of how far they are apart.
-_APART_M, _ONE = (3.0, 30.0), 0.35
-#: The nearest point beside one lies within half the way to the next along the road, or a little more.
+#: Two roads at these distances, metres, are a single road on the map if their nearest points on the map lie within this
+#: part of their distance from each other.
+_APART_M, _MERGED = (3.0, 30.0), 0.35
+#: The nearest point beside a road point lies within half the step along the road, or a little more.
 _BESIDE = 0.55
-#: Intersections within this multiple of that distance are of such a road: the map has them in the middle too.
+#: Intersections within this multiple of the step belong to such a road: the map has them in the middle too.
 _NEAR = 2.0
 #: A smaller share of the points does not bend a fit.
 _FEW = 0.03
@@ -328,10 +327,10 @@ _ROUNDS = (200, None)
 def refine_between(
     refined: Refined, scene: Scene, index: ReferenceIndex, matched: IntArray, options: RefineOptions
 ) -> tuple[Refined, Scene]:
-    """Refine a homography once more where the map has one road for two of the mask.
+    """Refine a homography again if the map has a single road for two roads of the mask.
 
-    Return it and the scene with road points between the two, or what was given where there are few, or where no more of
-    the points lie on roads so: a false road beside a true one looks alike.
+    Returns the homography and the scene with road points between the two. Returns both unchanged if such points are
+    few, or if no more points lie on roads afterwards: a false road beside a true road looks alike.
     """
     found, seen = refined, scene
     for n_points in _ROUNDS:
@@ -348,9 +347,9 @@ def refine_between(
 def between_carriageways(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray
 ) -> tuple[Scene, IntArray]:
-    """Return the scene with road points halfway between two roads where the map has one; itself if there are few.
+    """Return the scene with road points halfway between two roads that the map has as one; the scene itself if few.
 
-    The matches (N,) come without those at such points.
+    Matches (N,) of intersections at such points become -1.
     """
     if not len(scene.points):
         return scene, matched
@@ -360,12 +359,12 @@ def between_carriageways(
     apart = np.hypot(*across.T)
     reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
     feet = [_nearest(start, along, reach, index) for start in (at, at + across)]
-    one = np.hypot(*(feet[0] - feet[1]).T) < _ONE * apart  # not where anything is NaN
-    if one.mean() < _FEW:
+    merged = np.hypot(*(feet[0] - feet[1]).T) < _MERGED * apart  # False for NaN
+    if merged.mean() < _FEW:
         return scene, matched
     points = scene.points.copy()
-    points[one] = Homography(matrix).inverse().everywhere(at[one] + 0.5 * across[one])
-    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(one), _NEAR * step_px) >= 0
+    points[merged] = Homography(matrix).inverse().everywhere(at[merged] + 0.5 * across[merged])
+    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(merged), _NEAR * step_px) >= 0
     return replace(scene, points=points), np.where(there, -1, matched)
 
 
@@ -377,7 +376,7 @@ def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, index: Refere
 
 
 def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
-    """Return which of `points` (S, 2), `among` those numbered, lies nearest to each of `xy` (N, 2); -1: none within."""
+    """Return the number of the nearest of `points` (S, 2), `among` these, to each of `xy` (N, 2), or -1: too far."""
     nearest, least = np.full(len(xy), -1), np.full(len(xy), away**2)
     for number in among:
         square = ((xy - points[number]) ** 2).sum(axis=1)

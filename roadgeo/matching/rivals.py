@@ -1,12 +1,12 @@
-"""The best other place: always looked for, and compared with the best place by one likelihood.
+"""The best rival of a place: it is always looked for, and compared with the place by the same likelihood.
 
-A place is worth its lead over the best other one. Where streets form a lattice other places explain a query almost as
-well: roads that both explain do not count, and those of only one speak for it. Others are those that the search
-met, and, where these leave it a lead, those that shifts and turns of the place lead to, on the map around it. Where one
-of them explains more, it is the best place, and is compared in its turn.
+The score of a place is its lead over the best other place. Where streets form a lattice, other places explain a query
+almost as well: roads that both explain do not count, roads that only one explains favour it. Rivals are the other
+places that the search met and, if the place leads these, shifts and turns of the place on the map around it. A rival
+that explains more becomes the best place, and is compared in its turn.
 
-Two numbers make the lead: how many pieces of the query speak for the place rather than for the best other one (see
-`Evidence.lead`), and how far its likelihood stands out of that of all others (`log10_gap`).
+The lead has two parts: the pieces of the query that favour the place over the best rival (see
+`Evidence.compared_with`), and the gap between its likelihood and the rivals' (`log10_gap`).
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from roadgeo.matching.triples import larger
 
 __all__ = ["N_LAID", "Other", "Rivals", "Standing", "log10_gap", "similar_places"]
 
-#: Streets that cross at right angles fit themselves when they are turned by one.
+#: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
-#: Most and fewest others by which a gap is judged; least spacing of them (log10).
+#: Most and fewest other places by which a gap is judged; their least spacing (log10).
 _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
-#: Most times that another place may turn out to be the better one.
+#: Most times that a rival may turn out to be better.
 _MOST_TURNS = 12
 
 
-#: A place that leads all places nearby by so many powers of ten, and is contradicted by less than so many, is not
-#: compared further if the best of them explains less than this part of it: streets do not repeat there. Of 274 masks
-#: turned over four led by so much, where a city is like its mirror image: they were contradicted by 8.7 and more.
+#: A place is not compared further if it leads all places nearby by the first score, is contradicted by less than the
+#: second, and the best place nearby explains less than this part of it: streets do not repeat there. Four of 274
+#: mirrored masks led by the first, where a city is like its mirror image: they were contradicted by 8.7 and more.
 _CERTAIN, _DOUBTED, _REPEATING = 12.0, 1.0, 0.5
-#: Streets around are looked at where the places that were met leave this part of the lead that is needed. At wrong
-#: places they leave up to a tenth, at right ones nine tenths and more.
+#: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
+#: that part is up to a tenth, at right places nine tenths and more.
 _WORTH_LOOKING = 0.5
 #: Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
 #: proportion. At right places of masks of which up to half is gone, false, stale or bent the share is 0 in nine of ten,
@@ -57,10 +57,10 @@ _DOUBT = 60.0
 #: Number of the places met by the search that are compared, the likeliest; and of road points that each of those around
 #: is laid by roughly.
 _N_KNOWN, _N_POINTS = 12, 200
-#: Number of the likeliest of those around that are laid finely.
+#: Number of the likeliest places around that are fully refined.
 N_LAID = 8
-#: Middles of two places lie further from each other than this share of half the frame's diagonal, and fewer than this
-#: share of the roads that are met at one are met at the other (see `Evidence.shared`), unless that explains more.
+#: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
+#: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
 #: Streets around a place, and the blocks beside it.
 _AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
@@ -68,9 +68,9 @@ _NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
 
 
 class Standing(NamedTuple):
-    """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it.
+    """A place, its best rival (3, 3) if it has any, and its lead over the rival (log10).
 
-    `log10_likelihood`, `rival_likelihood`: the likelihood of each, by the same yardstick.
+    `log10_likelihood`, `rival_likelihood`: the log10 likelihood of each, at the same metres per pixel.
     """
 
     model: Hypothesis
@@ -81,12 +81,12 @@ class Standing(NamedTuple):
 
     @property
     def is_beaten(self) -> bool:
-        """Whether the other one explains more."""
+        """Whether the rival explains more."""
         return self.rival is not None and self.rival_likelihood > self.log10_likelihood
 
 
 class Other(NamedTuple):
-    """Another place: its log10 likelihood, by how much the place leads it, itself (3, 3), and what speaks against."""
+    """Another place: its log10 likelihood, the lead over it, its homography (3, 3), and the score against it."""
 
     worth: float
     lead: float
@@ -95,7 +95,7 @@ class Other(NamedTuple):
 
 
 class Rivals:
-    """Compares the likeliest place of each part of a map with the best other one; each place once."""
+    """Compares the likeliest place of each part of a map with its best rival; each place once."""
 
     def __init__(
         self,
@@ -108,35 +108,35 @@ class Rivals:
         self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
         self._known: dict[int, Standing] = {}  # by the place's id, which its standing keeps from being given again
-        self._doubts: dict[int, tuple[FloatArray, float]] = {}  # of a place as it was laid
+        self._doubts: dict[int, tuple[FloatArray, float]] = {}  # with the matrix as it was then
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
-        """Return the part whose likeliest place leads all others by twice what is needed, if there is one."""
+        """Return the part whose likeliest place leads all others by twice the score needed, or None."""
         best = max(parts, key=self._explained)
         if max((model.log10_odds for model in self.estimators[best].verified), default=-math.inf) < self.needed:
-            return None  # a place that was met is too good a rival already
+            return None  # a place that was met is already too good a rival
         standing = self.standing(best)
         return best if standing is not None and standing.log10_lead >= 2.0 * self.needed else None
 
-    def _explained(self, one: Search[Hypothesis]) -> float:
-        estimator = self.estimators[one]
+    def _explained(self, part: Search[Hypothesis]) -> float:
+        estimator = self.estimators[part]
         return max(map(estimator.explained, estimator.verified), default=-math.inf)
 
-    def standing(self, one: Search[Hypothesis]) -> Standing | None:
-        """Compare the likeliest place of a part with the best other one; None where nothing was verified."""
-        estimator = self.estimators[one]
+    def standing(self, part: Search[Hypothesis]) -> Standing | None:
+        """Compare the likeliest place of a part with its best rival; return None if no place was verified."""
+        estimator = self.estimators[part]
         ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[:_N_KNOWN], key=lambda one: one.log10_likelihood - self.doubt(estimator, one))
+        best = max(ranked[:_N_KNOWN], key=lambda model: model.log10_likelihood - self.doubt(estimator, model))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
             if standing.rival is None or not standing.is_beaten:
                 break
             best = self._take(estimator, standing.rival, ranked)
-        one.seconds += time.perf_counter() - started
+        part.seconds += time.perf_counter() - started
         return standing
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
@@ -165,7 +165,7 @@ class Rivals:
             )
 
         def stand(others: Sequence[Other]) -> Standing:
-            rival = max(others, key=lambda one: one.worth - one.against, default=None)
+            rival = max(others, key=lambda other: other.worth - other.against, default=None)
             lead = min((other.lead for other in others), default=math.inf)
             lead += log10_gap(worth, [other.worth for other in others])
             if rival is None:
@@ -186,7 +186,7 @@ class Rivals:
         return stand(rivals)
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
-        """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
+        """Return the score against a place for the roads that it contradicts; computed once for each matrix."""
         known, matrix = self._doubts.get(id(model)), model.matrix
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
@@ -195,7 +195,7 @@ class Rivals:
         return known[1]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
+        """Return the hypothesis of a rival that explains more than the likeliest place: a known one, or a new one."""
         known = next((model for model in ranked if model.matrix is matrix), None)
         if known is not None:
             return known
@@ -211,7 +211,7 @@ def similar_places(
     match: MatchOptions,
     around: LocalSearchOptions = _AROUND,
 ) -> list[Other]:
-    """Return other places around one that most roads would fit, the likeliest laid as well as they can be."""
+    """Return other places around a place that fit most roads; the likeliest are fully refined."""
     scene, index = evidence.scene, evidence.index
     center = Homography(matrix).everywhere(scene.center)
     drawn: Drawn = {}
@@ -222,20 +222,20 @@ def similar_places(
             continue
         shifts = search_nearby(turned, scene, index, around, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
-    found.sort(key=lambda one: -one[0])
-    laid = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])
-    roughly = sorted((Other(*compare(one), one) for one in laid), key=lambda one: -one.worth)
-    finely = (_lay(one.matrix, scene, index, match, None) for one in roughly[:N_LAID])
-    return [*(Other(*compare(one), one) for one in finely), *roughly[N_LAID:]]
+    found.sort(key=lambda place: -place[0])
+    fits = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])
+    roughly = sorted((Other(*compare(fit), fit) for fit in fits), key=lambda other: -other.worth)
+    finely = (_lay(other.matrix, scene, index, match, None) for other in roughly[:N_LAID])
+    return [*(Other(*compare(fit), fit) for fit in finely), *roughly[N_LAID:]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:
-    """Log10 odds that the best of places explains more than the next by more than chance.
+    """Return the log10 score of the best place's lead over the next, beyond chance.
 
-    Of many places that explain something by chance the best few differ by exponential spacings (Renyi, 1953), however
-    many there are: the gap to the next is compared with how far that one leads the others. Where streets form a lattice
-    others crowd below the best; where they do not, few come near. A place that explains less than another has a gap
-    below zero, whatever speaks against the other.
+    Among many places that fit by chance, the best few differ by exponential spacings (Renyi, 1953), whatever their
+    number: the gap to the next place is compared with the next place's lead over the others. Where streets form a
+    lattice, others crowd below the best; elsewhere few come near. A place that explains less than another has a gap
+    below zero, whatever the score against the other.
     """
     ranked = np.sort(others)[::-1][: _TAIL + 1]
     if not len(ranked):
@@ -250,7 +250,7 @@ def log10_gap(best: float, others: Sequence[float]) -> float:
 def _lay(
     start: FloatArray, scene: Scene, index: ReferenceIndex, match: MatchOptions, n_points: int | None
 ) -> FloatArray:
-    """Refine a place; where it loses its way, it stays as it is."""
+    """Refine a place; return the start if the refinement diverges."""
     gsd = sampling(start, scene.size)
     matched, _ = match_intersections(start, scene, index)
     refined = refine(start, scene, index, matched, match.refine, n_points, held=True)

@@ -1,10 +1,10 @@
-"""Proposals from roads: one query intersection and the roads around it, laid on every intersection of the map.
+"""Proposals from roads: a query intersection and the roads around it, compared with every intersection of the map.
 
-Triples of intersections need three neighbours that are all intact. Where roads are missing, false or few, one intact
-intersection and the roads about it still fix their place: turned so that two branches agree, at each of many scales,
-most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance depends on the
-scale and on how dense the map's roads are at the place: without that, scales at which the query shrinks to a few blocks
-would crowd out the rest.
+Triples of intersections need three intact neighbours. Where roads are missing, false or few, a single intact
+intersection and the roads around it still fix their place. Turned so that two branches agree, at each of many scales,
+most road points fall on roads of the map at the right place, and few elsewhere. The number expected by chance depends
+on the scale and on the density of the map's roads at the place. Without this correction, scales at which the query
+shrinks to a few blocks would crowd out the rest.
 
 The map's roads are drawn for that as a raster of direction bits, and as rings around its intersections, which are kept
 while they are in use.
@@ -82,7 +82,7 @@ class RoadRaster:
     rings : (N, WORDS) uint64
         Around each intersection of the reference, as far as `has_rings` (N,) is set (see `draw_rings_of`).
     radii : (RINGS,) float64
-        Of the middles of the rings, cells.
+        Radii of the rings' middles, cells.
     """
 
     origin: tuple[float, float]
@@ -113,7 +113,7 @@ class RoadRaster:
         self.has_rings[missing] = True
 
 
-#: Rasters in use anywhere; and those that are kept, the one used last at the end, up to a number of bytes together.
+#: Rasters in use anywhere; and rasters kept for later, the last used at the end, up to a number of bytes together.
 _in_use: WeakValueDictionary[ReferenceIndex, RoadRaster] = WeakValueDictionary()
 _kept: OrderedDict[ReferenceIndex, RoadRaster] = OrderedDict()
 _MOST_BYTES = 500_000_000
@@ -122,13 +122,13 @@ _MOST_BYTES = 500_000_000
 def make_raster(index: ReferenceIndex) -> RoadRaster:
     """Return the raster of a reference, drawn anew unless it is in use or kept from before.
 
-    Drawing takes some hundredths of a second, and 9 MB, for a city of 400 km2. Those used last are kept, up to a size:
-    many masks are looked for on the same maps, one after the other.
+    Drawing takes some hundredths of a second, and 9 MB, for a city of 400 km2. The rasters used last are kept, up to a
+    size: many masks are searched on the same maps, one after the other.
     """
     drawn = _in_use.get(index) or _draw(index)
     _in_use[index] = _kept[index] = drawn
     _kept.move_to_end(index)
-    while len(_kept) > 1 and sum(one.nbytes for one in _kept.values()) > _MOST_BYTES:
+    while len(_kept) > 1 and sum(raster.nbytes for raster in _kept.values()) > _MOST_BYTES:
         _kept.popitem(last=False)
     return drawn
 
@@ -176,7 +176,7 @@ _TRIAL = Trial(0.55, 1.5)
 
 @dataclass(frozen=True)
 class Votes:
-    """Proposals of one query intersection. Dimension: M proposals, the best first.
+    """Proposals of a query intersection. Dimension: M proposals, the best first.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class Votes:
 class _Around(NamedTuple):
     """Road points as seen from one intersection, nearest first: (P, 2) offsets and (P,) distances in pixels.
 
-    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) marks those that run straight away from it.
+    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) marks roads that run straight away from it.
     """
 
     offsets: FloatArray
@@ -300,9 +300,9 @@ _LEAST_SHARE = 0.3
 _TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
 #: Prior standard deviation of the two perspective parameters, while a place grows.
 PERSPECTIVE_SIGMA = 0.4
-#: After each of the first stages this number of an intersection's proposals go on, those that lie closest to roads, and
-#: those that had most votes. Of 396 intersections of which one of 40 proposals led to the place of a broken mask 395 do
-#: so still, at half the time; in lattices 255 of 266, at a quarter.
+#: Proposals of an intersection that are kept after each of the first stages because they are closest to roads, and
+#: those kept for most votes. With all 40 kept, 396 intersections led to the place of a broken mask; now 395 do, in half
+#: the time. In lattices 255 of 266 do, in a quarter.
 _GO_ON, _SURE = (16, 6, 3), 2
 
 
@@ -315,7 +315,7 @@ class Grown:
 
 
 class RoadGrower:
-    """Grows proposals of one scene on one map."""
+    """Grows proposals of a scene on a map."""
 
     def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions) -> None:
         self.scene, self.index = scene, index
@@ -416,7 +416,7 @@ class Turnout:
 
 
 class RoadRound(NamedTuple):
-    """The results of one query intersection: places and turns tried, proposals that were to grow, those that did."""
+    """The results of a query intersection: places and turns tried, proposals to grow, and places that grew."""
 
     anchor: int
     n_tried: int
@@ -451,7 +451,7 @@ class RoadSearch:
         self.grower = RoadGrower(scene, index, camera)
 
     def rounds(self) -> Iterator[RoadRound]:
-        """Yield the places that grew of one anchor's proposals after another."""
+        """Yield the places that grew from each anchor's proposals."""
         xy = self.scene.intersections.xy
         anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS)
         for n, votes in enumerate(self.ahead.map(self.voter.votes, anchors)):
@@ -460,7 +460,7 @@ class RoadSearch:
             self.turnout.n_tried += votes.n_tried
             best = slice(_MAX_GROWN)
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
-            some = sorted(grown, key=lambda one: -one.closeness)
+            some = sorted(grown, key=lambda place: -place.closeness)
             yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[:_MAX_KEPT])
 
 

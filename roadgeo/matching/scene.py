@@ -35,10 +35,10 @@ __all__ = [
 ]
 
 
-#: Of more intersections, those nearest to the middle of the frame are kept: they place a mask as surely, and time and
-#: memory are bounded.
+#: Most intersections, the nearest to the middle of the frame, which locate a mask as well and bound time and memory;
+#: and most neighbours of each.
 _MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
-#: Points along the roads, at most and no closer than this, pixels: some for a quick look, more for one intersection's
+#: Most points along the roads, and their least spacing, pixels: a few for quick comparisons, more for an intersection's
 #: surroundings.
 _POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
 #: Cells of the reduced frame along its longer side.
@@ -177,7 +177,7 @@ def prepare_scene(
 ) -> Scene:
     """Prepare a vectorized mask for matching; `size` is (width, height), `observed` and `probability` (height, width).
 
-    `probability` is that of `RoadMask`: roads that are less sure count less.
+    `probability` comes from `RoadMask`: less certain roads count less.
     """
     width, height = size
     length = float(graph.edge_lengths().sum())
@@ -215,8 +215,9 @@ def prepare_scene(
     )
 
 
-#: Lengths in road widths: of a mask's roads those are one road, or one intersection, that lie so near to each other;
-#: shorter ends are none; tangents are fitted to branches of this length, which begin this far from the intersection.
+#: Lengths in road widths: roads nearer to each other are a single road, intersections nearer a single intersection;
+#: shorter dead ends are dropped; tangents are fitted to branches of this length, which begin this far from the
+#: intersection.
 _MERGE, _FUSE, _STUB, _TANGENT, _SKIP, _BRANCH = 1.4, 1.0, 1.5, 4.5, 0.6, 0.8
 
 
@@ -246,7 +247,7 @@ class Query:
 
 
 def read_query(mask: RoadMask | AnyArray | str | Path) -> Query:
-    """Read a mask, unless it is one already, and trace it.
+    """Read a mask, unless it is a `RoadMask` already, and trace it.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it.
 
-One loop drives one problem or many parts of one: breadth first, a little of every part at each stage. It ends with
-one answer that stands out from all others, whichever parts they come from. How long it goes on without one is
-measured by work, which is counted, so that a busy machine finds what an idle one finds; the clock is the last resort.
+The loop drives a problem, or many parts of a problem: breadth first, a little of every part at each stage. It ends when
+an answer stands out from all others, whichever parts they come from. Without such an answer it ends after a limit of
+work, which is counted, so that a busy machine finds the same as an idle machine; the clock is the last resort.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 __all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search", "search_together"]
@@ -21,12 +22,12 @@ Model = TypeVar("Model")
 
 
 class Estimator(Protocol[Model]):
-    """The interface of a problem, or of one part of it, to the loop."""
+    """The interface of a problem, or of a part of it, to the loop."""
 
     def stages(self) -> Iterator[Iterator[Iterable[Model]]]:
-        """Yield stage after stage, the cheapest first; each yields hypotheses a round at a time, the best hopes first.
+        """Yield the stages, the cheapest first; each yields hypotheses a round at a time, the most promising first.
 
-        All hypotheses that one sample of the query admits belong to one round, so that twins of a place are met
+        All hypotheses that a sample of the query admits belong to the same round, so that twins of a place are met
         together.
         """
 
@@ -48,13 +49,13 @@ class SearchOptions:
     Attributes
     ----------
     accept, margin : float
-        A model stands out that reaches this score, and leads the best different model by as much.
+        A model stands out if it reaches `accept`, and leads the best different model by `margin`.
     work_limit_s : float
-        No further round is begun, and no further model scored, after this work: seconds of a usual machine, counted,
-        not measured, so that answers do not depend on the load. On a map of 15,000 intersections, and on a larger one
-        more by the root of the ratio.
+        No further round begins, and no further model is scored, after this work: seconds of a usual machine, counted,
+        not measured, so that answers do not depend on the load. The limit holds for a map of 15,000 intersections; on a
+        larger map it grows by the root of the ratio.
     time_limit_s : float
-        The same after this time by the clock: the last resort.
+        The same limit by the clock: the last resort.
     """
 
     accept: float = 8.0
@@ -79,7 +80,7 @@ class _Budget:
 
 
 class Search(Generic[Model]):
-    """The search of one part, which goes on a round at a time.
+    """The search of a part, which proceeds a round at a time.
 
     Attributes
     ----------
@@ -110,7 +111,7 @@ class Search(Generic[Model]):
 
     @property
     def score(self) -> float:
-        """That of the best answer, -inf where there is none."""
+        """Score of the best answer, -inf without an answer."""
         return self.leaders[0][0] if self.leaders else float("-inf")
 
     @property
@@ -119,7 +120,7 @@ class Search(Generic[Model]):
         return self.leaders[0][1] if self.leaders else None
 
     def advance(self, budget: _Budget) -> None:
-        """Do one round, or pass to the next stage where this one has none left."""
+        """Do a round, or pass to the next stage after the last round."""
         started = time.perf_counter()
         models = None if self._rounds is None else next(self._rounds, None)
         if models is None:
@@ -142,7 +143,7 @@ class Search(Generic[Model]):
                 break
 
     def _charge(self, budget: _Budget) -> None:
-        """Take the work done since the last time off what is left."""
+        """Subtract the work done since the last call from the work left."""
         work = self.estimator.work
         budget.left_s -= work - self._charged_s
         self._charged_s = work
@@ -150,12 +151,12 @@ class Search(Generic[Model]):
     def _enter(self, score: float, model: Model) -> None:
         """Keep the two best different answers after a new one came in."""
         ranked = sorted([*self.leaders, (score, model)], key=lambda item: -item[0])
-        others = (one for one in ranked[1:] if not self.estimator.same(one[1], ranked[0][1]))
-        self.leaders = [ranked[0], *[one for one in [next(others, None)] if one is not None]]
+        others = (item for item in ranked[1:] if not self.estimator.same(item[1], ranked[0][1]))
+        self.leaders = [ranked[0], *islice(others, 1)]
 
 
 def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> Search[Model]:
-    """Score hypotheses round by round until one stands out, they are exhausted, or a limit is reached."""
+    """Score hypotheses round by round until an answer stands out, they are exhausted, or a limit is reached."""
     alone = Search(estimator)
     search_together([alone], options)
     return alone
@@ -167,20 +168,20 @@ def search_together(
     same: Callable[[Search[Model], Model, Search[Model], Model], bool] | None = None,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None = None,
 ) -> None:
-    """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
+    """Search many parts until an answer stands out on all parts, they are exhausted, or a limit is reached.
 
-    A round of each part in turn, one stage after another: what one sample of the query leads to is met on all parts
-    before an answer is accepted. `same` returns whether models of two parts, which may overlap, mean one answer.
-    `proves` returns the part whose answer is proved otherwise than by its score, if any is: it is asked where an answer
-    stands out, which is accepted only then, and at the end of each stage.
+    Each part does a round in turn, stage after stage: the hypotheses of a sample of the query are met on all parts
+    before an answer is accepted. `same` returns whether models of two parts, which may overlap, are the same answer.
+    `proves` returns the part whose answer is proved by other means than its score, or None. It is called when an answer
+    stands out, which is accepted only if proved, and at the end of each stage.
     """
     options = options or SearchOptions()
     ended_by = _Together(parts, options, same, proves).run()
-    for one in parts:
-        if ended_by in ("work", "time") and not one.ended:
-            one.stopped = ended_by
+    for part in parts:
+        if ended_by in ("work", "time") and not part.ended:
+            part.stopped = ended_by
         else:
-            one.stopped = one.stopped or ("exhausted" if one.ended else "elsewhere")
+            part.stopped = part.stopped or ("exhausted" if part.ended else "elsewhere")
 
 
 class _Together(Generic[Model]):
@@ -198,10 +199,10 @@ class _Together(Generic[Model]):
 
     def run(self) -> str:
         stage = 0
-        while not all(one.ended for one in self.parts):
-            while here := [one for one in self.parts if one.stage == stage and not one.ended]:
-                for one in here:
-                    one.advance(self.budget)
+        while not all(part.ended for part in self.parts):
+            while here := [part for part in self.parts if part.stage == stage and not part.ended]:
+                for part in here:
+                    part.advance(self.budget)
                     if spent := self.budget.spent:
                         return spent
                 best = next(filter(self._stands_out, here), None)
@@ -213,23 +214,23 @@ class _Together(Generic[Model]):
         return "exhausted"
 
     def _is_proved(self, best: Search[Model] | None) -> bool:
-        """Whether an answer ends the search: that of a part which stands out, unless another proof is asked for."""
+        """Return whether an answer ends the search: `best`, or, if a proof is required, a proved answer."""
         proved = best if self.proves is None else self.proves(self.parts)
         if proved is not None:
             proved.stopped = "accepted"
         return proved is not None
 
-    def _stands_out(self, one: Search[Model]) -> bool:
-        """Whether a part's best answer leads every other one, on any part."""
-        if one.score < self.options.accept:
+    def _stands_out(self, part: Search[Model]) -> bool:
+        """Return whether a part's best answer leads every other answer, on any part."""
+        if part.score < self.options.accept:
             return False
-        best = one.leaders[0][1]
-        if any(one.score - score < self.options.margin for score, _ in one.leaders[1:]):
+        best = part.leaders[0][1]
+        if any(part.score - score < self.options.margin for score, _ in part.leaders[1:]):
             return False
         return all(
-            one.score - score >= self.options.margin or (self.same is not None and self.same(one, best, other, model))
+            part.score - score >= self.options.margin or (self.same is not None and self.same(part, best, other, model))
             for other in self.parts
-            if other is not one
+            if other is not part
             for score, model in other.leaders
         )
 
@@ -239,7 +240,7 @@ Result = TypeVar("Result")
 
 
 class Ahead:
-    """Does independent pieces of work ahead of their use in a number of threads; in one, each when it is used.
+    """Does independent pieces of work in threads, ahead of their use; with a single thread, each when it is used.
 
     Attributes
     ----------
@@ -268,8 +269,8 @@ class Ahead:
             while begun:
                 yield begun.popleft().result()
         finally:
-            for one in begun:
-                one.cancel()
+            for future in begun:
+                future.cancel()
 
     def close(self) -> None:
         """End the threads; unfinished results are dropped."""

@@ -1,9 +1,9 @@
 """The places where a mask's roads run on roads of the map: shifts and turns of a start.
 
-The roads around the frame are drawn on a coarse raster, one layer for each of 16 directions. A road point of the query
-reads the layer of its own direction: the layer around its place is the answer for all shifts at once, and the sum over
-all points counts those on roads under each shift (a generalised Hough transform; Ballard 1981). Turns are
-tried one by one.
+The roads around the frame are drawn on a coarse raster, a layer for each of 16 directions. A road point of the query
+reads the layer of its own direction: the layer around its place answers for all shifts at once, and the sum over all
+points counts the points on roads under each shift (a generalised Hough transform; Ballard 1981). Turns are tried one by
+one.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ALONG = math.radians(18.0)
 _BYTE = 255
 
 
-#: Places nearer than this to a better one, metres, are the same.
+#: A place nearer than this to a better place, metres, is the same place.
 APART_M = 25.0
 
 
@@ -130,7 +130,7 @@ def search_nearby(
 
 
 def _turns(radius_m: float, options: LocalSearchOptions) -> FloatArray:
-    """Return the turns to try: the frame's corners move by less than a road's width from one to the next."""
+    """Return the turns to try: from turn to turn the frame's corners move by less than a road's width."""
     step = min(math.degrees(0.8 * options.road_m / radius_m), 1.5)
     n = math.ceil(options.turn_deg / step)
     return np.asarray(np.linspace(-options.turn_deg, options.turn_deg, 2 * n + 1))
@@ -164,7 +164,7 @@ def _best_shifts(
     turn: float,
     options: LocalSearchOptions,
 ) -> list[Shift]:
-    """Return the best shifts of one turn."""
+    """Return the best shifts of a turn."""
     reach, side = round(options.reach_m / options.cell_m), layers.shape[1]
     cells = np.floor((points - origin) / options.cell_m).astype(int) - reach
     angle = np.arctan2(*(ends - points).T[::-1]) % math.pi
@@ -179,10 +179,10 @@ def _best_shifts(
             some[:] = 0
     votes += some
     peaks = votes == cv2.dilate(votes, np.ones((5, 5), np.uint8))
-    most = 4 * options.n_places  # several cells of one peak may be equal
-    at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks of so many votes or more
+    most = 4 * options.n_places  # several cells of a peak may be equal
+    at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks with at least each number of votes
     rows, columns = np.nonzero(peaks & (votes >= max(int((at_least >= most).sum()) - 1, 0)))
-    away = np.hypot(rows - reach, columns - reach)  # of equals the nearest: where blocks repeat, one beside
+    away = np.hypot(rows - reach, columns - reach)  # the nearest of equal peaks: where blocks repeat, a neighbour
     order = np.lexsort((away, -votes[rows, columns].astype(int)))[:most]
     return [
         Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, 1.0, int(votes[r, c]) / len(points))
@@ -193,9 +193,9 @@ def _best_shifts(
 def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
     """Return the best shifts that lie apart from better ones."""
     kept: list[Shift] = []
-    for one in sorted(shifts, key=lambda shift: (-shift.share, math.hypot(shift.east_m, shift.north_m))):
-        if all(math.hypot(one.east_m - k.east_m, one.north_m - k.north_m) >= APART_M for k in kept):
-            kept.append(one)
+    for shift in sorted(shifts, key=lambda shift: (-shift.share, math.hypot(shift.east_m, shift.north_m))):
+        if all(math.hypot(shift.east_m - k.east_m, shift.north_m - k.north_m) >= APART_M for k in kept):
+            kept.append(shift)
         if len(kept) == options.n_places:
             break
     return kept

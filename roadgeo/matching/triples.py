@@ -1,9 +1,9 @@
 """Hypotheses from triples of neighbouring intersections.
 
-For one query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's
-table. Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map,
-make a proposal: one triple alone may agree by chance with thousands of others, two or three that share an anchor hardly
-ever.
+For a query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's
+table. Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map, make
+a proposal: a single triple may agree with thousands of others by chance, two or three triples that share an anchor
+hardly ever.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ def smaller(n_reference: int) -> float:
 _MIN_SHAPE = 0.12
 #: Number of pairs of tangents that are looked up of an intersection with three tangents or more.
 _CODES_PER_VERTEX = 1
-#: Hits of one proposal may differ by this part of their maps' size.
+#: Hits of a proposal may differ by this part of their affine maps' size.
 _AFFINE_TOLERANCE = 0.3
-#: Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
+#: Most intersections that are weighed as anchors, evenly chosen: weighing all would take longer than using some.
 _MAX_WEIGHED = 1000
 
 
@@ -77,8 +77,8 @@ class TripleOptions:
         Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
         of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
     max_hits, max_compared : int
-        An anchor's triples are looked up, the rarest first, until this number is found or compared: on a map of 15,000
-        intersections, and on a larger one more by the root of the ratio.
+        An anchor's triples are looked up, the rarest first, until this number is found or compared on a map of 15,000
+        intersections. On a larger map the limits grow by the root of the ratio.
     """
 
     n_neighbours: int = 8
@@ -95,7 +95,7 @@ class TripleOptions:
 
 @dataclass(frozen=True)
 class Proposals:
-    """The proposals of one anchor. Dimensions: M proposals, K neighbour slots.
+    """The proposals of an anchor. Dimensions: M proposals, K neighbour slots.
 
     Attributes
     ----------
@@ -139,10 +139,10 @@ def propose(
     options: TripleOptions,
     ahead: Ahead = ALONE,
 ) -> Iterator[list[Proposals]]:
-    """Yield, for one anchor after another (see `TripleOptions.spread`), its proposals on each of the indexes.
+    """Yield each anchor's proposals on each of the indexes (see `TripleOptions.spread` for the order of anchors).
 
-    All indexes together determine which anchors and triples come first, and how much is compared, as if they were
-    one; each gets a share of the bounds that grows with its number of entries to compare.
+    All indexes together determine the order of anchors and triples and the bounds, as if they were a single index. Each
+    gets a share of the bounds that grows with its number of entries to compare.
     """
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
@@ -184,9 +184,9 @@ class Sweep:
     ----------
     triples : TripleOptions
     max_anchors : int
-        On a map of 15,000 intersections or more; on a smaller one, where each takes less time, more.
+        Most anchors on a map of 15,000 intersections or more; more on a smaller map, where each takes less time.
     most_more : float
-        At most by this factor.
+        Greatest factor by which `max_anchors` grows on a smaller map.
     """
 
     triples: TripleOptions
@@ -201,7 +201,7 @@ class Sweep:
         min_ratio: float,
         ahead: Ahead = ALONE,
     ) -> Iterator[list[Proposals]]:
-        """Yield proposals for one query intersection after another on each index, the most promising first.
+        """Yield each query intersection's proposals on each index, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
         least ratio of its singular values. `ahead` looks for the next intersections meanwhile.
@@ -214,8 +214,8 @@ class Sweep:
 #: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
 _FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True, angle_tolerance_deg=7.5)
 _SECOND = Sweep(_FURTHER, 30)
-#: The sweeps that follow one another where roads propose after them: of the rarest triples few intersections suffice;
-#: and those where roads propose nothing.
+#: The sweeps if roads propose after them, when a few intersections with the rarest triples suffice; and the sweeps if
+#: roads propose nothing.
 BEFORE_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 12), _SECOND)
 WITHOUT_ROADS: tuple[Sweep, ...] = (
     Sweep(TripleOptions(), 40),
@@ -232,7 +232,7 @@ class _Room(threading.local):
 
 
 def _starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
-    """Return where the cells of the tables of all indexes would start in one; in larger units where they are many."""
+    """Return the starts of the cells in a table of all indexes together; in larger units for many entries."""
     return indexes[0].table_starts if len(indexes) == 1 else _added_starts(indexes)
 
 
@@ -256,12 +256,12 @@ def _count_alike(seen: TripleQuery, anchors: IntArray, starts: Int32Array) -> In
 
 
 def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex]) -> FloatArray:
-    """Return how to share out an anchor's work: half of it by size, half by the entries to compare."""
+    """Return each index's share of an anchor's work: half of it by size, half by the entries to compare."""
     if len(indexes) == 1:
         return np.ones(1)
-    one = np.array([anchor])
+    anchors = np.array([anchor])
     sizes = np.array([len(index) for index in indexes], float)
-    costs = [np.maximum(_count_alike(seen, one, index.table_starts), 0).sum() for index in indexes]
+    costs = [np.maximum(_count_alike(seen, anchors, index.table_starts), 0).sum() for index in indexes]
     return np.asarray(sizes / sizes.sum() + np.array(costs) / max(sum(costs), 1)) / 2.0
 
 
@@ -274,12 +274,12 @@ def _look_up(
     limits: TripleLimits,
     hits: Hits,
 ) -> Proposals:
-    """Look an anchor's triples up in one index; return their proposals there, the best placed first."""
+    """Look up an anchor's triples in an index; return their proposals there, the best placed first."""
     max_hits, max_compared = bounds
     ids, affine = hits = Hits(hits.ids[:max_hits], hits.affine[:max_hits])
     n_hits, n_compared = look_up_each(seen, anchor, slots, max_compared, index.triple_map, limits, hits)
     k = seen.neighbours.shape[1]
-    # hits on one intersection of the map that agree make one proposal: most neighbours placed first
+    # hits on the same map intersection that agree make a proposal; proposals with most neighbours placed come first
     out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
     out_affine = np.empty((len(out_ids), 4))
     out_placed = np.empty(len(out_ids), np.int64)
@@ -293,12 +293,12 @@ def _look_up(
 
 
 def _scattered(numbers: IntArray) -> IntArray:
-    """Return keys that put numbers in an order of no meaning, always the same: those of the map run from the south."""
+    """Return keys that sort numbers in a fixed scattered order: the map's intersections are numbered from the south."""
     return (numbers * 2654435761) % 2**32  # Knuth's multiplicative hash
 
 
 def farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:
-    """Yield the name of the point nearest to the middle of all, then always of the one farthest from those before."""
+    """Yield the name of the point nearest to the middle, then always of the point farthest from all yielded before."""
     if len(xy) == 0:
         return
     away = -np.hypot(*(xy - (xy.min(axis=0) + xy.max(axis=0)) / 2.0).T)
