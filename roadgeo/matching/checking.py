@@ -58,7 +58,7 @@ class CheckOptions:
 
 @dataclass(frozen=True)
 class Checked:
-    """The result for a given place; None: not known.
+    """The result for a given place; None for unknown values.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Checked:
     matrix : (3, 3) float64 or None
         Query plane to reference plane, corrected.
     log10_lead, rival : float, Displacement or None
-        Log10 odds of the best place against its hardest rival, and where that lies.
+        Log10 lead of the best place over its strongest rival, and the rival's displacement.
     agreeing, agreeing_as_given : float or None
         Share of the roads of mask and map that agree at the best place, and at the given place.
     matched : (N,) int or None
@@ -86,7 +86,7 @@ class Checked:
 
 
 def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options: CheckOptions | None = None) -> Checked:
-    """Check the place of a scene: nothing further than the search's reach is looked at.
+    """Check the place of a scene, within the search's reach.
 
     Parameters
     ----------
@@ -188,14 +188,14 @@ class _Judge:
         return measure(self.corners, Homography(place.matrix)(self.scene.corners), covariance)
 
     def gap(self, a: FloatArray, b: FloatArray) -> float:
-        """Root mean square distance, metres, of where two homographies put the frame's corners."""
+        """Return the root mean square distance, metres, between the frame's corners under two homographies."""
         gaps = Homography(a)(self.scene.corners) - Homography(b)(self.scene.corners)
         return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
 
 
 def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     """Judge the best of some places, the best first, against the others."""
-    # The best place against the rival that comes nearest to it.
+    # The best place against its strongest rival.
     options = judge.options
     best = judge.refine(places[0].matrix, None)
     rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= APART_M]

@@ -49,22 +49,22 @@ _ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _VERIFIED_S, _VERIFIED_POINT_S = 2e-3, 0
 class MatchOptions:
     """Options of all stages of matching, nested.
 
-    The sweeps follow one another until a place stands out; where they lead nowhere, roads propose.
+    Sweeps follow each other until a place stands out. If no place does, roads propose.
 
     Attributes
     ----------
     sweeps, without_roads : tuple of Sweep
-        The sweeps where roads propose after them, and where these are left out: they go on for longer then.
+        The sweeps before roads propose, and the longer sweeps if roads are not used.
     roads : bool
-        Whether roads propose where no triple leads to a place, rather than more sweeps.
+        Whether roads propose, rather than further sweeps, if no triple leads to a place.
     lens : bool
-        Whether a lens is looked for behind promising places.
+        Whether a lens is tried at promising places.
     max_places : int
         The sweeps also end when this many places were screened on a map of 15,000 intersections. On a larger map the
         limit grows by the root of the ratio. Where streets are alike, proposals abound, and late proposals are seldom
         right: 29 of 31 masks that took more than half a second had been found among the first 7,000 places.
     within : (west, south, east, north) or None
-        Degrees: the middle of the frame is known to lie there (see `geometry.areas`).
+        Box, in degrees, that is known to contain the middle of the frame (see `geometry.areas`).
     """
 
     sweeps: tuple[Sweep, ...] = BEFORE_ROADS
@@ -137,7 +137,7 @@ class TripleEstimator:
 
     @property
     def n_anchors(self) -> int:
-        """Intersections of the query that were looked for."""
+        """Intersections of the query that were looked up."""
         return len(self._anchors)
 
     def _count(self, n_places: int) -> None:
@@ -166,19 +166,19 @@ class TripleEstimator:
             yield fresh
 
     def _look_for(self, anchor: int) -> None:
-        """Count an intersection of the query that is looked for on the map."""
+        """Count an intersection of the query that is looked up on the map."""
         self._n_rounds += 1
         self._anchors.add(anchor)
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
-        """Whether a camera can have seen a grown hypothesis."""
+        """Return whether a camera can have seen a grown hypothesis."""
         hypothesis.fault = self.judge(hypothesis.matrix, rough=True)
         if hypothesis.fault is not None:
             self.events.note("refused", hypothesis.fault, hypothesis.matrix)
         return hypothesis.fault is None
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
-        """Whether a verified place that is promising was proposed by another intersection as well."""
+        """Return whether another intersection proposed a promising verified place as well."""
         return known.log10_likelihood >= _LEAST_LIKELY and self.same(known, hypothesis)
 
     def known_places(self) -> list[Hypothesis]:
@@ -262,14 +262,14 @@ class TripleEstimator:
         self._weigh(model)
 
     def _weigh(self, model: Hypothesis) -> None:
-        """Weigh a hypothesis, and the best place nearby where it leads all others that were met."""
+        """Weigh a hypothesis, and, if it leads all other verified places, the best place nearby."""
         self._charge(model)
         if model.log10_odds >= _LEADING:
             self.nearby(model)
             self._charge(model)
 
     def nearby(self, model: Hypothesis) -> float:
-        """Return the log10 likelihood of the best place nearby (see `Evidence.nearby`), which is looked for once."""
+        """Return the log10 likelihood of the best place nearby (see `Evidence.nearby`); computed once."""
         if model.nearby is None:
             self.n_nulls += 1
             gsd_m = sampling(model.matrix, self.scene.size)
@@ -277,7 +277,7 @@ class TripleEstimator:
         return model.nearby
 
     def _charge(self, model: Hypothesis) -> None:
-        """Give a hypothesis its odds: by how much it explains more than others do, less the places tried."""
+        """Score a hypothesis: its lead over other places, less the log10 number of places tried."""
         most = max(model.nearby or 0.0, self._most_elsewhere(model), 0.0)
         model.log10_odds = model.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1))
 
@@ -306,14 +306,14 @@ class TripleEstimator:
             model.take(seen)
 
     def scene_of(self, model: Hypothesis) -> Scene:
-        """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""
+        """Return the scene without the distortion that a hypothesis found."""
         lens_k1 = 0.0 if model.refined is None else model.refined.lens_k1
         return straighten_scene(self.scene, lens_k1) if lens_k1 else self.scene
 
     def _converge(self, model: Hypothesis, n_points: int | None, least: float) -> bool:
-        """Refine until nothing more agrees: more matches make a better fit, and that finds more matches.
+        """Refine until the agreement stops growing: more matches make a better fit, which finds more matches.
 
-        A place that is less likely than `least` is not refined again.
+        A place less likely than `least` is not refined again.
         """
         scene, before = self.scene, -1.0 if model.found is None else model.found.forward
         best, options = -1.0, self.refinement(model)
@@ -346,11 +346,11 @@ class TripleEstimator:
         return judge(matrix, self.scene.size, self.options.camera, rough)
 
     def may_be(self, matrix: FloatArray) -> bool:
-        """Whether a homography is plausible for the camera, and agrees with the user's hints on the place."""
+        """Return whether a homography is plausible for the camera, and agrees with the user's hints on the place."""
         return self.judge(matrix) is None and not self._is_far(matrix)
 
     def _is_far(self, matrix: FloatArray) -> bool:
-        """Whether the middle of the frame lies outside the circle, or the box, that the user gave."""
+        """Return whether the middle of the frame lies outside the user's circle or box."""
         if self.near is None and self.options.within is None:
             return False
         middle, plane, within = Homography(matrix).everywhere(self.scene.center), self.index.plane, self.options.within
@@ -359,7 +359,7 @@ class TripleEstimator:
         return within is not None and not lies_in(within, *to_lonlat(plane.crs, plane.to_crs(middle[None]))[0])
 
     def _fits_whole(self, model: Hypothesis) -> bool:
-        """Whether a hypothesis fits the whole frame, so that no better version of it is to be expected."""
+        """Return whether a hypothesis fits the whole frame: no better variant of it is expected."""
         if model.found is None or model.refined is None or not math.isfinite(model.log10_odds):
             return False
         frame_m = 2.0 * self.scene.half_size * sampling(model.matrix, self.scene.size)
@@ -370,6 +370,6 @@ class TripleEstimator:
         return np.array(model.spot(self.scene.size)[:2])
 
     def same(self, a: Hypothesis, b: Hypothesis) -> bool:
-        """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""
+        """Return whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size."""
         (x, y, reach_m), (other_x, other_y, _) = a.spot(self.scene.size), b.spot(self.scene.size)
         return math.hypot(x - other_x, y - other_y) < reach_m

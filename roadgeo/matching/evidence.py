@@ -46,7 +46,8 @@ _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
 _BLUR_CELLS = 0.35
 #: Usual distance between a mapped road and the true road, and usual error of a traced road.
 MAP_SIGMA_M, PIXEL_SIGMA_PX = 1.8, 1.0
-#: This length of road, query and map together, counts as one independent statement, but never less than so many pixels.
+#: This length of road, query and map together, counts as one independent statement, but never less than this number of
+#: pixels.
 STATEMENT_M, STATEMENT_PX = 480.0, 96.0
 #: Width of the frame's pieces by which two places are compared: the larger of these two.
 _PIECE_M, _PIECE_PX = 60.0, 12.0

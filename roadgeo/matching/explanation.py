@@ -144,12 +144,12 @@ class TruthStory:
     Attributes
     ----------
     lost_at : str or None
-        The first stage that it did not come out of: "map", "proposals", "on_roads", "survived", "camera", "verified",
-        "odds" or "margin"; None where it was located there. `said` is that in a sentence.
+        The stage that lost it: "map", "proposals", "on_roads", "survived", "camera", "verified", "odds" or "margin";
+        None if the mask was located there. `said` is the same in a sentence.
     counts : dict
-        How often the place was met at "proposals", "on_roads", "survived", "camera" (refused) and "verified".
+        The number of times the place was met at "proposals", "on_roads", "survived", "camera" (refused) and "verified".
     log10_odds : float or None
-        The best that it reached.
+        Its best score.
     """
 
     lon: float
@@ -162,18 +162,18 @@ class TruthStory:
 
 @dataclass(frozen=True)
 class Story:
-    """How the search on one reference went.
+    """The course of the search on a reference.
 
     Attributes
     ----------
     stopped : str
         As in `Search`; "elsewhere": a place on another reference ended it, "": there was nothing to search for.
     needed : dict
-        The log10 odds and the margin that are asked for.
+        The log10 odds and the margin that an answer needs.
     camera_refusals : dict
-        How often which reason kept a place that had grown from being verified.
+        The number of times each reason kept a grown place from being verified.
     starved_at : str or None
-        The first stage that nothing came out of, "camera", "odds" or "margin"; None where it was located.
+        The first stage without a result, "camera", "odds" or "margin"; None if the mask was located.
     """
 
     reference: str
@@ -200,7 +200,7 @@ class Story:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A location and how it came about: the roads seen in the mask, and a story for each reference."""
+    """A location and its derivation: the roads seen in the mask, and a story for each reference."""
 
     location: Location
     scene: Scene
@@ -213,7 +213,7 @@ class Explanation:
 
     @property
     def nearest(self) -> Story:
-        """The story of the reference that the mask was located on, or else came nearest to it."""
+        """The story of the reference on which the mask was located, or came nearest to it."""
 
         def rank(story: Story) -> tuple[bool, float]:
             best = max((place.scored.log10_odds for place in story.places), default=-math.inf)
@@ -289,7 +289,7 @@ class _Course:
         self.places = tuple(map(self._describe, self._distinct(sorted(entries, key=self._rank))))
 
     def _look_elsewhere(self) -> None:
-        """Grow some proposals that point elsewhere than a camera may, to report that they would fit."""
+        """Grow some proposals that the hints bar, to report that they would fit."""
         for proposals, allowed, _ in self.events.of("screened"):
             barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
             for hypothesis in self.search.grow(barred, np.arange(len(barred.reference)))[:_MAX_PLACES]:
@@ -489,7 +489,7 @@ class _TruePlace:
         return np.asarray(np.hypot(*(xy - self.xy).T) <= limit)
 
     def _is_there(self, matrix: FloatArray) -> bool:
-        """Whether a homography puts the middle of the frame near the truth."""
+        """Return whether a homography puts the middle of the frame near the truth."""
         scene = self.estimator.scene
         scale = np.array([sampling(matrix, scene.size)])
         return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])

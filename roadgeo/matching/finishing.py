@@ -1,8 +1,8 @@
-"""The last fit of a place that may be reported: to the whole frame, beside no street, and how sure its corners are.
+"""The last fit of a place that may be reported: to the whole frame, and with the standard deviation of its corners.
 
-During the search, cells of the frame where few roads are met wait: these roads may be met by chance. At the
-right place they are not. And a part of the frame may have settled on the next street: then the fit is too sure of
-itself, for nothing in it shows that.
+During the search, cells of the frame where few roads are met are left out: these roads may be met by chance. At the
+right place they are not. A part of the frame may also have settled on the next street. The standard deviations of such
+a fit are too small, and nothing in the fit shows it.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from roadgeo.matching.scene import Scene
 
 __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
 
-#: Where this much of the mask's roads agrees, no cell of the frame was left out; a fit to all cells loses hardly any.
+#: If this share of the mask's roads agrees, no cell of the frame was left out; and the part of that share that a fit to
+#: all cells may lose.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
 #: Corners are moved one by one by this distance, to see whether the fit comes back: metres in the middle of the frame,
-#: at least so many pixels; the number of road points of such fits; and the most rounds.
+#: and at least this number of pixels; the number of road points of such fits; and the most rounds.
 _BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = 24.0, 8.0, 150, 5
 #: A fit has come back if no corner is off by more than this part of the step. Another fit is better if this share of
 #: the road points lies on roads in addition.
@@ -44,19 +45,18 @@ _BACK, _BETTER = 0.125, 0.006
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
 
-#: Road points further apart than this multiple of the usual step lie on different roads. Longer roads are cut in pieces
-#: of this number of points: errors keep their sign over less.
+#: Road points further apart than this multiple of the usual step lie on different roads. Longer roads are cut into
+#: pieces of this number of points: errors are correlated over shorter lengths.
 _GAP, _PIECE = 1.5, 12
-#: Beyond three standard deviations no road is met: there the pull, 3 / (1 + 3^2), falls to nothing. Roads that are
-#: nearly as far count those at that end: they take its fall, over half a standard deviation, off the slope of the pull.
+#: Beyond three standard deviations no road is met: there the influence, 3 / (1 + 3^2), drops to zero. Roads at nearly
+#: that distance account for this drop, spread over half a standard deviation: it lowers the slope of the influence.
 _NEAR_END, _FALL = 2.5, 0.3 / 0.5
-#: Where the slopes would leave a fit undetermined, as where a mask is bent, all roads hold it, by this part of their
-#: weights.
+#: Where the slopes leave a fit undetermined, as for a bent mask, all roads hold it with this part of their weights.
 _LEAST_SLOPE = 0.17
 
 
 def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: float) -> None:
-    """Refine the best place of a map for the last time, and measure how sure its corners are.
+    """Refine the best place of a map for the last time, and estimate the covariance of its corners.
 
     A place is fitted to the whole frame only if its `score` may be reported: every part of a map has a best place.
     """
@@ -77,7 +77,7 @@ def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: 
 
 
 def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refined, agreeing: float) -> None:
-    """Refine a place with all cells of the frame, now that it is known."""
+    """Refine a place that is found with all cells of the frame."""
     options = replace(estimator.refinement(best), least_share=0.0)
     found = refine(refined.matrix, estimator.scene, estimator.index, best.matched, options, held=True)
     if found is not None and estimator.may_be(found.matrix):
@@ -87,7 +87,7 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
 def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> None:
     """Take a new fit for a place, if at least this share of the mask's roads agrees.
 
-    The earlier result stands: the odds rest on it.
+    The earlier agreement stays, for the score is based on it.
     """
     laid = best.lay(refined, estimator.scene, estimator.index)
     if laid.found is not None and laid.found.forward >= least:
@@ -174,9 +174,9 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
     normal = normals.sum(axis=0) + prior
     moved = np.linalg.solve(normal - normals, pulls[:, :, None])[:, :, 0]
     inverse = np.linalg.inv(normal)
-    # What the prior holds is as uncertain as the prior.
+    # Parameters that only the prior holds are as uncertain as the prior.
     covariance = moved.T @ moved + (equations.sigma_m / equations.unit) ** 2 * inverse @ prior @ inverse
-    if k1:  # nor was the middle of the lens estimated
+    if k1:  # the middle of the lens was not estimated either
         lens, across = Lens.of(k1, scene.size, y_up=True), rows[:, [2, 5]]
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         straight = equations.normalised(lens.straighten(scene.points[which]))

@@ -76,13 +76,13 @@ class Hypothesis:
         )  # fmt: skip
 
     def take(self, other: Hypothesis) -> None:
-        """Become another version of the same place."""
+        """Take over another variant of the same place."""
         vars(self).update(vars(other))
 
     def spot(self, size: tuple[int, int]) -> tuple[float, float, float]:
-        """Return x and y of the middle of a frame of that size, plane metres; nearer ones than the third are the same.
+        """Return x, y of the middle of a frame of this size, and the distance within which places are the same, metres.
 
-        It is kept, for in a lattice it is asked for without end.
+        The result is kept: in a lattice it is needed again and again.
         """
         if self._spot is None:
             frame = Frame(*size)
@@ -153,7 +153,7 @@ def grow_proposals(
         proposals.reference[chosen], proposals.affine[chosen], partners,
         index.point_buckets, limits, _MIN_MATCHED, matched, matrices, ratios,
     )  # fmt: skip
-    best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]  # others withered
+    best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]  # others were given up
     return [Hypothesis(matrices[m] / matrices[m, 2, 2], float(ratios[m]), matched[m]) for m in best]
 
 
@@ -161,7 +161,7 @@ def grow_proposals(
 SamePlace: TypeAlias = "Callable[[TripleEstimator, Hypothesis, TripleEstimator, Hypothesis], bool]"
 
 
-#: The places that grew from an anchor's proposals, by the identity of their part; without those taken.
+#: The places that grew from an anchor's proposals and are not taken yet, by the identity of their part.
 _Grown: TypeAlias = "dict[int, list[Hypothesis]]"
 
 
@@ -171,7 +171,7 @@ class SharedSweeps:
     Attributes
     ----------
     members : list
-        The parts; all have joined before the first takes anything.
+        The parts; all must join before the first takes a place.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class SharedSweeps:
         same_place: SamePlace | None = None,
         ahead: Ahead = ALONE,
     ) -> None:
-        """Begin without parts. `same_place` is asked of hypotheses on different parts."""
+        """Begin without parts. `same_place` compares hypotheses on different parts."""
         self.scene, self.camera, self.same_place, self.ahead = scene, camera, same_place, ahead
         self.members: list[TripleEstimator] = []
         self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
@@ -203,12 +203,12 @@ class SharedSweeps:
             n += 1
 
     def turnout(self, coarseness: float) -> Turnout:
-        """Return how many intersections of the scene vote, on all parts of some coarseness alike."""
+        """Return the number of intersections that vote, the same on all parts of this coarseness."""
         n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
         return self._turnouts.setdefault(coarseness, Turnout(n_map))
 
     def end(self) -> None:
-        """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""
+        """Drop the parts: each refers to this object, and the cycle would keep their maps open for a while."""
         self.members.clear()
         self._rounds.clear()
         self._done.clear()

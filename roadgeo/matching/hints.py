@@ -61,7 +61,7 @@ class Hint:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
-# All of these raise ValueError, "got ..., expected ...", for values that they cannot take.
+# All of these raise ValueError, "got ..., expected ...", for invalid values.
 
 
 def _expect(holds: bool, value: Any, form: str, why: str = "") -> None:
@@ -126,7 +126,7 @@ def _read_heading(value: Any) -> tuple[float, float]:
 
 
 def read_place(value: Any) -> tuple[float, float, float]:
-    """Return longitude, latitude (degrees) and a radius (metres); tell where the two were exchanged."""
+    """Return longitude, latitude (degrees) and a radius (metres); the error reports exchanged coordinates."""
     form = "LON,LAT,RADIUS in degrees and metres"
     lon, lat, radius = read_numbers(value, form, (3,), ",")
     swapped = _swapped((lat, lon), f",{radius:g}")
@@ -147,7 +147,7 @@ def read_box(value: Any) -> Box:
 
 
 def _swapped(exchanged: Sequence[float], rest: str = "") -> str:
-    """Ask whether longitudes and latitudes were exchanged; only remind of their order where that would be as wrong."""
+    """Return the remedy for a bad place: exchange the coordinates if that helps, else a reminder of their order."""
     lons, lats = exchanged[::2], exchanged[1::2]
     sound = max(map(abs, lons)) <= 180 and max(map(abs, lats)) <= 90 and sorted(lats) == [*lats]
     meant = ",".join(f"{number:g}" for number in exchanged) + rest
@@ -241,7 +241,7 @@ HINTS: dict[str, Hint] = {hint.name: hint for hint in _TABLE}
 
 
 def read_hint(name: str, value: Any) -> tuple[str, Any]:
-    """Return where a hint goes to, and its value as the search takes it.
+    """Return the option that a hint sets, and its value in the option's form.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptio
     Parameters
     ----------
     known : mapping
-        Values by `Hint.goes_to`; None is not known. A focal length "exif" is for the caller to look up.
+        Values by `Hint.goes_to`; None if unknown. The caller must look up a focal length "exif".
     """
     given = {name: value for name, value in known.items() if value is not None}
     if given.get("focal_px") == "exif":

@@ -42,11 +42,11 @@ __all__ = [
 #: Factor by which the roads' buckets are narrower than the intersections': roads are looked up within some 20 m.
 _FINER = 2
 
-#: Limits of an index from a stranger: the kernels sample segments every few metres, in each bucket that lists them.
+#: Limits of an index from an unknown source: kernels sample segments every few metres, in each bucket that lists them.
 _MAX_DISTANCE_M = 5e7
 _MAX_SEGMENT_M, _MAX_MEAN_SEGMENT_M = 1e6, 1e4
 
-#: How many times as far as usual roads are merged on a coarse map: as pixels of 2 to 12 m show them.
+#: Factor by which the merging distance of a coarse map exceeds the usual distance, for pixels of 2 to 12 m.
 COARSENESS = 6.0
 _LEAST_COARSE, _MOST_COARSE = 2.0, 50.0
 
@@ -297,9 +297,9 @@ def _are_short(segments: AnyArray, ids: AnyArray) -> bool:
 
 
 def check_table(index: ReferenceIndex) -> None:
-    """Check that every table entry points to intersections that exist, and stands where it is looked for.
+    """Check that every table entry points to intersections that exist, and is in the cell of its code.
 
-    `from_parts` leaves that to the kernels, which believe no entry: it would read the whole table.
+    `from_parts` leaves that to the kernels, which check every entry: here it would read the whole table.
     """
     entries = index.table_entries
     anchors = (entries >> np.uint64(40)).astype(np.int64)
@@ -365,9 +365,8 @@ def _tabulate(
 ) -> tuple[Int32Array, AnyArray]:
     """Return starts and entries of the table of triples (see `kernels.triple_codes`).
 
-    Within a cell the entries are sorted by their sides, so that a look-up passes over those that are not alike, and
-    among equals stand in random order, always the same: where a look-up ends before the cell does, it has seen all
-    parts of the map alike.
+    Within a cell the entries are sorted by their sides, so that a look-up skips entries with other sides. Entries with
+    equal sides are in a fixed random order: a look-up that ends before the cell does has seen all parts of the map.
     """
     sides = np.empty(tangents.shape, np.int8)
     find_sides(tangents, branches, sides)

@@ -24,22 +24,21 @@ __all__ = [
     "straighten_scene",
 ]
 
-#: Where this share of the mask's roads agrees no other fit is looked for.
+#: No other fit is tried if this share of the mask's roads agrees.
 ENOUGH = 0.8
-#: A fit without a lens that has grown over more of the frame puts this much more of the roads on roads.
+#: Least gain in the share of road points on roads for a fit without a lens that grew over more of the frame.
 _BETTER = 0.02
-#: A k1 counts when it is this many of its standard deviations from 0, and moves the frame's corners by at least this
-#: many pixels.
+#: Significance of k1 in its standard deviations, and the least movement of the frame's corners, pixels.
 _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
-#: Cells of the frame a side. The fit begins with the largest part of the frame in which road points lie on roads as
-#: often as in this part of the best cell's share, and about this number of points there are held at first.
+#: Cells along each side of the frame; the part of the best cell's share of road points on roads that cells need where a
+#: fit begins; and about the number of points there that are held at first.
 _CORE, _N_HELD = (10, 0.75), 50
 #: Road points that a fit needs.
 FEWEST = 12
 #: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the
 #: frame that meets wrong roads bends the whole fit.
 _MAX_RADIUS = (10.0, 5.0)
-#: Values of k1 to begin with in turn, until one explains enough.
+#: Starting values of k1, tried in turn until a fit explains enough.
 _STARTS = (0.0, -0.15, -0.08, 0.08)
 #: A fit that meets less than this share of the road points is dropped.
 _HOPELESS = 0.3

@@ -38,13 +38,13 @@ __all__ = [
 #: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
 #: Cauchy weights.
 _SIGMA_M, _SIGMA_PX = 1.2, 0.9
-#: Weight of a matched intersection against an independent road point: its centre is less certain. Matches take part
-#: when at least this share of their neighbours are matched.
+#: Weight of a matched intersection relative to an independent road point, for its centre is less certain. A match takes
+#: part if at least this share of its neighbours are matched.
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
-#: Errors of the map and of the mask keep their sign over about this length of road, metres: points closer than that are
-#: no independent observations.
+#: Errors of the map and of the mask are correlated over about this length of road, metres: closer points are not
+#: independent observations.
 _CORRELATION_M = 60.0
 #: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
 #: greater, they keep their sign as much further. Fitted to the corners of training masks.
@@ -222,7 +222,7 @@ class Equations:
             return None
         normal = normal + normal.T  # only the lower triangle was filled
         normal.flat[:: n + 1] *= 0.5
-        # Where the mask is bent, its errors keep their sign as much further as they are greater.
+        # Where the mask is bent, larger errors are correlated over proportionally longer roads.
         scatter = rms * max(1.0, rms / (_USUAL_RMS * self.sigma_m)) / self.unit
         covariance = np.asarray(np.linalg.inv(normal) * scatter**2, float)
         corners = self.corner_covariance(covariance[:8, :8])
@@ -265,7 +265,7 @@ def _grid(n: int) -> FloatArray:
 
 
 def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> float:
-    """Return the sum of the Cauchy weights of road points, as a homography lays them."""
+    """Return the sum of the Cauchy weights of road points under a homography."""
     equations = Equations(matrix, scene, index, RefineOptions())
     equations.meet()
     return float(np.nansum(equations.cauchy))
@@ -291,7 +291,7 @@ def refine(
     n_points : int, optional
         Use about this number of the scene's road points.
     held : bool
-        Hold the homography near its start also where there are matches enough: it is right all over the frame.
+        Hold the homography near its start even with enough matches: it is right all over the frame.
     """
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     equations = Equations(matrix, scene, index, options or RefineOptions(), step=step)

@@ -50,12 +50,12 @@ _CERTAIN, _DOUBTED, _REPEATING = 12.0, 1.0, 0.5
 #: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
 #: that part is up to a tenth, at right places nine tenths and more.
 _WORTH_LOOKING = 0.5
-#: Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
-#: proportion. At right places of masks of which up to half is gone, false, stale or bent the share is 0 in nine of ten,
-#: and 0.09 at most; at the best wrong ones of masks turned over it is 0.16 in the median.
+#: Score that a place loses if all its roads are contradicted, and in proportion (see `Evidence.contradicted`). At right
+#: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
+#: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
 _DOUBT = 60.0
-#: Number of the places met by the search that are compared, the likeliest; and of road points that each of those around
-#: is laid by roughly.
+#: Number of the likeliest places met by the search that are compared; and number of road points for the rough
+#: refinement of places around.
 _N_KNOWN, _N_POINTS = 12, 200
 #: Number of the likeliest places around that are fully refined.
 N_LAID = 8
@@ -81,7 +81,7 @@ class Standing(NamedTuple):
 
     @property
     def is_beaten(self) -> bool:
-        """Whether the rival explains more."""
+        """Return whether the rival explains more."""
         return self.rival is not None and self.rival_likelihood > self.log10_likelihood
 
 
@@ -104,10 +104,10 @@ class Rivals:
         needed: float,
         time_limit_s: float = math.inf,
     ) -> None:
-        """Places of fewer powers of ten than `needed` are not compared, and none after the time limit."""
+        """Places with a score below `needed` are not compared; no place is compared after the time limit."""
         self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
-        self._known: dict[int, Standing] = {}  # by the place's id, which its standing keeps from being given again
+        self._known: dict[int, Standing] = {}  # by the place's id, which is not reused while its standing exists
         self._doubts: dict[int, tuple[FloatArray, float]] = {}  # with the matrix as it was then
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
@@ -154,7 +154,7 @@ class Rivals:
         evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m, compare = _APART * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
-        # The larger the map, the more places may lead all that lie around them.
+        # The larger the map, the more places may lead all places around them by chance.
         against = 2.0 * math.log10(larger(self.ledger.n_reference)) + doubt
 
         def is_rival(other: Other) -> bool:
@@ -181,7 +181,7 @@ class Rivals:
         leads = standing.log10_lead >= _WORTH_LOOKING * self.needed
         if not leads and estimator.nearby(best) < _REPEATING * worth:
             return standing
-        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a block beside may be the place
+        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(matrix, evidence, compare, estimator.options, around))
         return stand(rivals)
 

@@ -63,7 +63,7 @@ _CELL_M, _REACH_M, RADIUS_M = 6.0, 8.0, 220.0
 
 
 def ring_of(metres: FloatArray) -> IntArray:
-    """Return the rings that distances lie in, 0 to RINGS - 1, on a map of coarseness 1; others are beyond."""
+    """Return the rings of distances on a map of coarseness 1: 0 to RINGS - 1, or a number outside."""
     inner_m = RADIUS_M / RING_STEP**RINGS
     return np.floor(np.log(np.maximum(metres, 1e-9) / inner_m) / math.log(RING_STEP)).astype(np.int64)
 
@@ -161,15 +161,15 @@ _SCALE_STEPS = np.array([0.96, 1.0, 1.04])
 
 #: How far branches that agree may be apart.
 _TOLERANCE = round(math.radians(20.0) * _PER_RADIAN)
-#: Nearer than this, metres, roads that run straight away from the intersection, with at least this cosine, are left
-#: out: they are its own branches, which agree by construction. It makes the right place stand out more.
+#: Roads nearer than this, metres, that run straight away from the intersection, with at least this cosine, are left
+#: out: they are its own branches, which agree by construction. The right place then stands out more.
 _OWN_M, _OWN_COS = 150.0, 0.95
 #: A scale at which fewer points are in reach is not tried.
 _LEAST_POINTS = 15
-#: Number of the best that are judged anew, of road points for that, and their greatest distance, metres. A coarse map
-#: multiplies all lengths.
+#: Number of the best proposals that are judged anew, number of road points that judge them, and their greatest
+#: distance, metres. A coarse map multiplies all lengths.
 _KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 100, 160, 260.0
-#: Share of those that meet roads in the right place, and by chance, in units of the density of roads there: they crowd
+#: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
 _TRIAL = Trial(0.55, 1.5)
 
@@ -293,8 +293,8 @@ def _whole(angles: AnyArray) -> IntArray:
 
 #: Road points used, and the part of half the frame's diagonal up to which an affine map will do.
 _MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
-#: A proposal withers where fewer of the points around it lie on roads. Wrong ones end at 0.3 to 0.4, masks of which
-#: 40 % are gone and 40 % false at 0.5 and more.
+#: A proposal is given up if a smaller share of the points around it lies on roads. Wrong proposals end at 0.3 to 0.4;
+#: right ones at 0.5 and more, on masks with 40 % of the roads gone and 40 % false.
 _LEAST_SHARE = 0.3
 #: Points within the sum of metres and pixels of a road lie on it.
 _TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
@@ -325,7 +325,7 @@ class RoadGrower:
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
 
     def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Grown]:
-        """Grow proposals of query intersection `anchor`; return those that did not wither, in their order.
+        """Grow proposals of query intersection `anchor`; return those that were not given up, in their order.
 
         `references` (M,) are the map intersections that it is laid on, `affines` (M, 4) how: 2 x 2, row-major.
         """
@@ -355,19 +355,19 @@ COARSE_PIXEL_M = 0.35
 
 #: Number of intersections of the query that vote, spread over the frame from its middle outwards.
 _MAX_ANCHORS = 30
-#: Fewer vote, but at least the second number, once the first number of places was tried on 15,000 intersections, on a
-#: larger map more by the root of the ratio; of a map in parts, on all of them together. In a lattice every crossing can
-#: be turned four ways.
+#: Voting ends early, but not before the second number of intersections, once the first number of places was tried on a
+#: map of 15,000 intersections, all parts together. On a larger map the number of places grows by the root of the ratio.
+#: In a lattice every crossing fits in four turns.
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
-#: Number of an anchor's proposals that grow, and of those that are then compared with the map.
+#: Number of an anchor's proposals that grow, and number of grown places that are compared with the map.
 _MAX_GROWN, _MAX_KEPT = 20, 2
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
 #: width on the ground lies in this range, metres.
 _TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
-#: Greater pixels hardly show the surroundings of an intersection: a place given by near is not searched further
-#: away than frames of such pixels reach.
+#: Larger pixels hardly show the surroundings of an intersection: the search around a hint `near` goes no further than
+#: frames of such pixels reach.
 _FAR_M = 5.0
 
 
@@ -389,7 +389,7 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
 
 @dataclass
 class Turnout:
-    """How many intersections of a query vote: as many on each part of a map, until enough was tried on all together.
+    """The number of query intersections that vote: the same on each part, until enough was tried on all together.
 
     Attributes
     ----------
@@ -398,7 +398,7 @@ class Turnout:
     n_tried : int
         Places and turns tried on them until now.
     last : int or None
-        How many vote in the end, once that is known.
+        The final number, once it is known.
     """
 
     n_map: int
@@ -407,7 +407,7 @@ class Turnout:
     _asked: int = field(default=0, init=False)
 
     def includes(self, n: int) -> bool:
-        """Whether the n-th votes, from 0; the part that comes to it first decides for all."""
+        """Return whether the n-th intersection (from 0) votes; the first part to reach it decides for all."""
         if self.last is None and n >= self._asked:
             self._asked = n + 1
             if n >= _LEAST_ANCHORS and self.n_tried >= _MAX_TRIED * larger(self.n_map):

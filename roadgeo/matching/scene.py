@@ -43,8 +43,8 @@ _MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
 _POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
 #: Cells of the reduced frame along its longer side.
 _FIELD_CELLS = 400
-#: Roads, and branches of intersections, agree whose directions differ by less, degrees: so far a proposal made of them
-#: may turn the image's up. And the cosine of that.
+#: Greatest difference of the directions of roads, or branches, that agree, degrees, and its cosine: a proposal may turn
+#: the image's up by as much.
 AGREE_DEG = 25.0
 MIN_COS = math.cos(math.radians(AGREE_DEG))
 #: A road's middle is traced within a pixel.
@@ -69,7 +69,7 @@ class Scene:
     weights : (S,) float64
         Weight of each point where roads are compared: its probability of road, 1 where the mask has none.
     dense_points, dense_directions : (D, 2) float64
-        The same, closer together: enough of them within a few roads of any place.
+        The same with a smaller spacing, for enough points within a few roads of any place.
     road_length_px : float
         Length of all roads.
     n_edges : int

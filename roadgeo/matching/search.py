@@ -39,7 +39,7 @@ class Estimator(Protocol[Model]):
         """Return the log10 odds of a model."""
 
     def same(self, a: Model, b: Model) -> bool:
-        """Whether two models mean the same answer."""
+        """Return whether two models are the same answer."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ class Search(Generic[Model]):
     stage : int
         Number of the stage that comes next.
     ended : bool
-        Whether all stages are through.
+        Whether all stages are done.
     stopped : str
         Why it ended: "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
         ended the search.
     seconds : float
-        Spent on this part.
+        Time spent on this part.
     """
 
     def __init__(self, estimator: Estimator[Model]) -> None:

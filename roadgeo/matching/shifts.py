@@ -45,7 +45,7 @@ APART_M = 25.0
 
 @dataclass(frozen=True)
 class LocalSearchOptions:
-    """How far and how finely is searched.
+    """The reach and the resolution of a local search.
 
     Attributes
     ----------

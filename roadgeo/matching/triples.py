@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-#: Intersections of the maps that bounds are made for: a city's.
+#: Intersections of the map for which search limits are set: a city's.
 _USUAL_SIZE = 15_000
 
 
@@ -54,7 +54,7 @@ def smaller(n_reference: int) -> float:
 
 #: Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
 _MIN_SHAPE = 0.12
-#: Number of pairs of tangents that are looked up of an intersection with three tangents or more.
+#: Number of pairs of tangents that are looked up for an intersection with three or more tangents.
 _CODES_PER_VERTEX = 1
 #: Hits of a proposal may differ by this part of their affine maps' size.
 _AFFINE_TOLERANCE = 0.3
@@ -64,18 +64,18 @@ _MAX_WEIGHED = 1000
 
 @dataclass(frozen=True)
 class TripleOptions:
-    """How triples are looked up and gathered.
+    """Options of the look-up of triples.
 
     Attributes
     ----------
     n_neighbours : int
         Triples are formed with pairs of this number of nearest neighbours of the anchor.
     angle_tolerance_deg : float
-        How far tangents may turn in the equilateral frame.
+        Greatest difference of tangents in the equilateral frame.
     spread : bool
-        Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
-        Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
-        of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
+        Whether the order of anchors is spread over the frame, from its middle outwards, or begins with rare triples.
+        Rare triples are quick to look up, but often rare because they are wrong: on `noisy` and `hard` training masks
+        9 % of the rarest sixth of the anchors lead to the place, and 44 % of the commonest sixth.
     max_hits, max_compared : int
         An anchor's triples are looked up, the rarest first, until this number is found or compared on a map of 15,000
         intersections. On a larger map the limits grow by the root of the ratio.
@@ -147,7 +147,7 @@ def propose(
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / _MAX_WEIGHED)))
-    # how many entries of the tables each pair of an anchor's neighbours would have to be compared with
+    # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
     seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
@@ -156,7 +156,7 @@ def propose(
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     limits = TripleLimits(_CODES_PER_VERTEX, tolerance, MIN_COS, scale, min_ratio)
     room = _Room(options.bounds(n_reference)[0])
-    # anchors with rare codes first, or those that lie furthest from the ones before
+    # anchors with rare codes first, or each time the anchor furthest from all before
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
@@ -178,7 +178,7 @@ def propose(
 
 @dataclass(frozen=True)
 class Sweep:
-    """One pass over the query's anchors: how many, and how widely their triples are looked up.
+    """A pass over the query's anchors: their number, and the options for their triples.
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class Sweep:
         return islice(anchors, int(self.max_anchors * more))
 
 
-#: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
+#: If the rarest triples lead to no place, triples with more neighbours are used, all over the frame.
 _FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True, angle_tolerance_deg=7.5)
 _SECOND = Sweep(_FURTHER, 30)
 #: The sweeps if roads propose after them, when a few intersections with the rarest triples suffice; and the sweeps if
@@ -225,7 +225,7 @@ WITHOUT_ROADS: tuple[Sweep, ...] = (
 
 
 class _Room(threading.local):
-    """Where each thread puts its hits."""
+    """Each thread's room for hits."""
 
     def __init__(self, most: int) -> None:
         self.hits = Hits(np.empty((most, 5), np.int64), np.empty((most, 4)))
