@@ -338,6 +338,7 @@ ROADS = (
     ),
     _option("index", "--name", "", "Of the reference, in the list. Empty: after the place, the file or the layer."),
     _option("index", "--kinds", "Which roads"),
+    _option("index", "--replace", "Replace a reference of that name"),
     *_fold(_option("index", "--tunnels"), _option("index", "--attribution", "", "Whom to name beside the map.")),
     Option(
         QgsProcessingParameterFileDestination, "OUTPUT", "Keep it in a file of its own",
