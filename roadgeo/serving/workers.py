@@ -373,7 +373,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     hints = {**asked.hints, "time_limit_s": asked.time_limit_s}
     if hints.get("focal_px") == "exif":
         hints["focal_px"] = focal_in_pixels(asked.path)
-    options = apply_hints(LocateOptions(), hints)
+    options = replace(apply_hints(LocateOptions(), hints), take=hints.get("take"))
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     seen = Path(asked.path).parent.with_name(OWN) / SEEN

@@ -277,6 +277,26 @@ def test_one_of_two_places_is_chosen(page, served, hard):
     assert workers.asked[-1].hints["near"][2] < 450
 
 
+def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
+    """Of a refusal that lists two places, the second is taken."""
+    _, workers, mask, _ = served
+
+    def refuse(mask, references, options):
+        found = locate(mask, references, options)
+        places = (found.places[0], replace(found.places[0], log10_odds=-1.0))
+        refused = Location(mask.name, "not_located", "no place", "town", seen=found.seen, alternatives=places)
+        return replace(refused, size=found.size, reason_code=Reason.FEW_ROADS)
+
+    monkeypatch.setattr("roadgeo.workflows.locate", refuse)
+    give(page, mask, "far.png")
+    wait_for(page, "Not located")
+    expect(page.locator("#map .pin.place")).to_have_count(2)
+    page.click("#places li:nth-child(2) button")
+    wait_for(page, "Chosen by you")
+    assert workers.asked[-1].hints["take"] == 2
+    expect(page.locator("#reason")).to_contain_text("place 2 of 2")
+
+
 def test_points_tell_where_it_is_how_large_a_pixel_and_where_up_is(page, served, hard):
     _, workers, mask, lonlat = served
     give(page, mask, "hard.png")

@@ -76,3 +76,10 @@ def test_any_hints_are_finite_numbers_or_refused(values):
         return
     for value in found.values():
         assert value is True or value is False or np.isfinite(value).all()
+
+
+def test_a_place_to_take_is_a_whole_number_from_1():
+    assert read_query_string("take=2") == {"take": 2}
+    for text in ("take=0", "take=1.5", "take=x", "take=1e9", "take=nan"):
+        with pytest.raises(HTTPException, match="take: got"):
+            read_query_string(text)

@@ -110,7 +110,10 @@ export async function showAnswer(base, view, found) {
   set("roads", place ? [feature("MultiLineString", place.roads)] : []);
   set("matches", matches.map((match) => feature("LineString", [match.map, match.seen])));
   set("ends", matches.map((match) => feature("Point", match.map, { residual: match.residual_m })));
-  if (!place) return;
+  if (!place) {
+    showRefused(found);
+    return;
+  }
   if (place.warped) {
     map.addSource("photo", { type: "image", url: `${HERE}${base}/warped.webp`, coordinates: place.warped });
     map.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "outline-case");
@@ -119,6 +122,14 @@ export async function showAnswer(base, view, found) {
   const box = place.outline.reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds());
   if (found.status === "ambiguous") (found.alternatives ?? []).forEach(({ center }) => box.extend([center.lon, center.lat]));
   fit(box);
+}
+
+/** Outline the best places of a refusal. */
+function showRefused(found) {
+  const rings = (found?.alternatives ?? []).map((one) => one.footprint_lonlat).filter(Boolean);
+  if (!rings.length) return;
+  set("outline", rings.map((ring) => feature("LineString", [...ring, ring[0]])));
+  fit(rings.flat().reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds()));
 }
 
 function set(source, features) {

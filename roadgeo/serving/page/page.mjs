@@ -3,7 +3,7 @@ import * as view from "./map.mjs";
 import { hintsOf } from "./points.mjs";
 
 const $ = (id) => document.getElementById(id);
-const WORDS = { located: "Located", ambiguous: "Two places", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
+const WORDS = { located: "Located", ambiguous: "Two places", chosen: "Chosen by you", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
 const KEPT = "roadgeo.session";
 const answers = [];  // latest first: { id, base, name, status, message, progress, document, view, hints }
 let current = null, kept = 20, maxBytes = Infinity, hasMap = false, maps = [];
@@ -167,7 +167,7 @@ function choose(entry) {
 
 function show(entry) {
   const { document: found, view: seen, status } = entry;
-  const over = status !== "running", placed = Boolean(seen?.place), sure = status === "located";
+  const over = status !== "running", placed = Boolean(seen?.place), sure = status === "located" || status === "chosen";
   document.body.classList.add("has-answers");
   $("answer").hidden = false;
   $("answer-name").textContent = entry.name;
@@ -190,7 +190,9 @@ function show(entry) {
     view.showAnswer(entry.base, seen, found).then(() => entry === current && showPlaces(entry));
     view.showArea(sure ? null : entry.hints.near);
   }
-  $("places").hidden = status !== "ambiguous" || !placed;
+  const refused = hasMap && status === "not_located" && found?.alternatives.length > 0;
+  $("places").hidden = !refused && (status !== "ambiguous" || !placed);
+  $("places").querySelector("p").textContent = refused ? "None is sure enough. If you know one to be right, take it:" : "Which one is it?";
   if (sure) showFiles(entry);
 }
 
@@ -267,14 +269,24 @@ async function showFiles(entry) {
 
 function showPlaces(entry) {
   const { status, document: found } = entry;
+  if (status === "not_located") {
+    offer((found?.alternatives ?? []).map(({ center }) => center), "Take it", (i) => again(entry, { ...entry.hints, take: i + 1 }));
+  }
   if (status !== "ambiguous") return;
   const side = found.gsd_m * Math.max(...found.size);
   const places = [found.center, ...found.alternatives.map((one) => one.center)].slice(0, 6);
+  offer(places, "It is this one", (i) => {
+    const lonlat = [places[i].lon, places[i].lat];
+    again(entry, { ...entry.hints, near: [...lonlat, radius(lonlat, places, side)] });
+  });
+}
+
+/** Show places by letters, on the map and in a list with a button each. */
+function offer(places, words, choosePlace) {
   $("places").querySelector("ol").replaceChildren(...places.map((place, i) => {
-    const letter = "ABCDEF"[i], lonlat = [place.lon, place.lat];
-    const take = () => again(entry, { ...entry.hints, near: [...lonlat, radius(lonlat, places, side)] });
-    view.addMarker(lonlat, letter, `Place ${letter}: it is this one`, "place").getElement().addEventListener("click", take);
-    const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `It is this one: ${degrees(place)}`);
+    const letter = "ABCDEF"[i], take = () => choosePlace(i);
+    view.addMarker([place.lon, place.lat], letter, `Place ${letter}: ${words.toLowerCase()}`, "place").getElement().addEventListener("click", take);
+    const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `${words}: ${degrees(place)}`);
     return make("li", {}, there);
   }));
 }
@@ -451,6 +463,7 @@ function showPairs() {
   $("unpick").hidden = !all.length;
   if (!hasMap || current.status === "ambiguous") return;
   view.clearMarkers();
+  if (!all.length) showPlaces(current);
   pairs.forEach(({ lonlat }, i) => {
     const marker = view.addMarker(lonlat, i + 1, `Point ${i + 1} on the map`, "mapped", { draggable: true });
     marker.on("dragend", () => {
