@@ -1,4 +1,4 @@
-"""Least squares for a camera and its lens: fitted to points, to roads, or to both, and how sure that makes a place.
+"""Least squares for a camera and its lens: a fit to points, to roads, or to both, and its covariance.
 
 The model is a homography in normalised coordinates, query (x - x0) / half_size to reference (X - X0) / unit, `unit`
 being half_size times the ground sampling there, so that it is near a rotation; before it, the lens of `geometry.lens`.
@@ -39,7 +39,7 @@ __all__ = [
 LEAST_W = 0.02
 #: Steps of an adjustment in which points are held near their start.
 _HELD_STEPS = 6
-#: As in `geometry.lens`, and the greatest k1 that a fit may come to.
+#: As in `geometry.lens`, and the greatest k1 of a fit.
 _UNFOLDED, _NEWTON_STEPS, _MOST_K1 = 0.98, 8, 0.5
 
 
@@ -117,7 +117,7 @@ def begin_system(
 def solve_system(
     p: NDArray[np.float64], normal: NDArray[np.float64], right: NDArray[np.float64], factor: NDArray[np.float64]
 ) -> float:
-    """Solve normal equations and move the parameters; return the largest move, -1 where that fails."""
+    """Solve normal equations and move the parameters; return the largest move, -1 if the solution fails."""
     if not cholesky(normal, factor):
         return -1.0
     solve_cholesky(factor, right)
@@ -264,7 +264,7 @@ def _determinant(p: NDArray[np.float64]) -> float:
 
 @kernel(forceinline=True)
 def own_sigma(reach_m: float, sigma_m: float, map_sigma_m: float, mask_sigma: float) -> float:
-    """Return how many times less sure than in the middle a point is, by the reach of a step of 1 there.
+    """Return a point's standard deviation, relative to the middle of the frame, from the reach of a step of 1 there.
 
     The other arguments are as in `structs.AdjustLimits`.
     """
@@ -320,13 +320,13 @@ def meet_roads(
     factor: Floats2,
     met: Met,
 ) -> int:
-    """Find the road of each road point whose place is sure enough; return how many there are.
+    """Find the road of each road point whose place is certain enough; return the number of such points.
 
     Parameters
     ----------
     p : (9,) float64
     factor : (n, n) float64
-        Cholesky factor of the present normal matrix, by which places are unsure; zeros where they are known.
+        Cholesky factor of the present normal matrix, for the uncertainty of places; zeros if they are known.
     met : Met
         Filled.
     """
@@ -344,7 +344,7 @@ def meet_roads(
             continue
         dx /= length
         dy /= length
-        # How far the road may lie follows from how sure the fit is here.
+        # The search radius follows from the uncertainty of the fit here.
         reach_m = plane.unit * area * shrink / (w * w * length)
         own[i] = own_sigma(reach_m, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
         point_row(p, u, v, (mu, mv), -dy, dx, row)
@@ -411,10 +411,10 @@ def adjust(
 ) -> tuple[int, float]:
     """Adjust a camera by Gauss-Newton with Cauchy weights.
 
-    The first step takes matched intersections, and points held where the map to be adjusted put them, for the first
-    `_HELD_STEPS`. Then a road point's residual is its distance across the nearest road of the map that runs its way.
-    Its standard deviation is predicted from the present system: it is searched as far as three times that, and not at
-    all beyond the greatest radius, so that the fit grows outwards from where it is sure.
+    The first step uses matched intersections, and, for `_HELD_STEPS` steps, points held where the start put them. Then
+    the residual of a road point is its distance across the nearest road of the map in its direction. Its standard
+    deviation is predicted from the present system. The search radius is three times that; a point whose radius exceeds
+    the greatest is left out, so that the fit grows outwards from where it is certain.
 
     Parameters
     ----------
@@ -459,7 +459,7 @@ def adjust(
         if largest < 0.0:
             return -1, np.inf
         p[8] = min(max(p[8], -_MOST_K1), _MOST_K1)
-        # Not done while points are held, or more roads are still being met.
+        # The iteration goes on while points are held, or more roads are met.
         settled = iteration > (1 if held.query.shape[0] == 0 else _HELD_STEPS)
         if settled and largest * plane.unit < limits.tolerance_m and used <= previous:
             break

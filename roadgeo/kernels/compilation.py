@@ -42,7 +42,7 @@ Progress = Callable[[int, int], None]
 
 _LOG = logging.getLogger(__name__)
 
-#: The newest numba whose private parts `machine_code` was tried with; kernels of later ones are left to numba whole.
+#: The newest numba whose private parts `machine_code` was tested with; later versions of numba run the kernels whole.
 _NEWEST_NUMBA = (0, 68)
 
 #: Options for kernels that match, a tenth quicker: no check for division by zero, divisions may become products, and a

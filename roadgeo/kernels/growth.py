@@ -321,7 +321,7 @@ def grow(
     n_matched, n_tested, goes_on = _expand(growth, query, points, limits, n_seeds, matched)
     if not goes_on:
         return n_matched, n_tested, -np.inf
-    # The model now stands on all: match everything anew and fit once more.
+    # The model now rests on all matches: match everything anew and fit again.
     ratio = 0.0
     for _ in range(2):
         n_matched, n_tested, ratio = _match_anew(growth, query, points, limits.min_cos, matched, distance)

@@ -42,7 +42,7 @@ def fit_branches(
     coords : (C, 2) float64
     lengths : (E,) float64
     skip, reach : float
-        The branch is taken between these distances along it; a short one between what is there.
+        The line is fitted between these distances along the branch, or to the whole of a shorter branch.
     least : float
         Branches shorter than this get NaN.
 
@@ -124,7 +124,7 @@ def sort_few(values: NDArray[np.floating], n: int) -> None:
 
 @kernel()
 def _merge_tangents(angle: NDArray[np.float64], count: int, merge_angle: float, tangents: NDArray[np.float32]) -> None:
-    """Make one tangent of angles that are nearly one line (eq. 2-3).
+    """Merge angles of nearly the same line into a tangent (eq. 2-3).
 
     `angle[:count]` is ascending, in [0, pi); `count` is 1 or more.
     """
@@ -165,7 +165,7 @@ def describe_intersections(
     tangents: Singles2,
     residual: Singles1,
 ) -> None:
-    """Refine each centre by its branch lines (eq. 1) and merge tangents that are nearly one line (eq. 2-3).
+    """Refine each centre by its branch lines (eq. 1) and merge tangents of nearly the same line (eq. 2-3).
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def describe_intersections(
     merge_angle : float
         Radians.
     stiffness : float
-        Weight of the node against one line: decides where the lines do not.
+        Weight of the node relative to a line: it decides where the lines do not.
     max_shift : float
         Centres move no further than this from their node.
     xy, rays, tangents, residual

@@ -45,7 +45,7 @@ def _nearest(buckets: PairBuckets, x: float, y: float, code: int, radius: float)
 def count_inliers(
     models: Floats3, xy: Floats2, codes: Ints1, buckets: PairBuckets, radius: float, one_to_one: bool, best: int
 ) -> tuple[int, int]:
-    """Count the query intersections that land near a reference intersection of their type (eq. 10).
+    """Count the query intersections that are mapped near a reference intersection of their type (eq. 10).
 
     Parameters
     ----------

@@ -236,7 +236,7 @@ def tie_runs(
 def roads_alongside(
     xy: Floats2, along: Floats2, reach: Floats1, least: float, most: float, min_cos: float, out: Floats2
 ) -> None:
-    """Find how far beside each road point the nearest road lies that runs its way.
+    """Find the vector from each road point across to the nearest road in its direction.
 
     Parameters
     ----------
@@ -249,8 +249,7 @@ def roads_alongside(
     min_cos : float
         Least |cosine| of the angle between the two roads.
     out : (S, 2) float64
-        Filled: the way across to the other road, at right angles to the mean of their directions; NaN where there is
-        none.
+        Filled: the vector across to the other road, at right angles to the mean of their directions; NaN without one.
     """
     for i in range(len(xy)):
         nearest = most

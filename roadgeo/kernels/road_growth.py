@@ -22,7 +22,7 @@ __all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
 _FIRST, _MORE, _ENOUGH = 60, 1.45, 120
 #: Search radii of a stage's steps, metres: a proposal's scale and turn are rougher than a grown map's predictions.
 _FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
-#: How far a stage may take the map from the one before: standard deviations of its linear part, and of its place.
+#: Prior of a stage's change of the map: standard deviations of its linear part, and of its place.
 _LINEAR_SIGMA, _PLACE_SIGMA_M = 0.08, 10.0
 _POINT_SIGMA_M = 12.0
 _FEWEST = 6
@@ -31,12 +31,12 @@ _LEAST_W = 0.05
 
 
 class Stages(NamedTuple):
-    """How growth proceeds.
+    """Options of growth.
 
-    `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points on roads;
-    `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count that turn from a
-    point's direction by less than `min_cos` allows; only `go_on` maps go on after each of the first stages, those whose
-    points lie closest to roads, and besides them the first `sure` ones.
+    Maps are affine up to `affine_until`, in normalised units. A stage fails with less than `least_share` of its points
+    on roads. `perspective_sigma` is the prior standard deviation of the two perspective parameters. `min_cos` limits
+    the angle between a road and a point's direction. After each of the first stages only the `go_on` maps whose points
+    are closest to roads are kept, and the first `sure` maps.
     """
 
     affine_until: float
@@ -61,7 +61,7 @@ def _nearest(
     grid: tuple[float, float, float],
     shape: tuple[int, int],
 ) -> tuple[float, float, float, float]:
-    """Return how far the nearest road lies from a mapped point, across the road, the road's direction, and w.
+    """Return the distance of the nearest road from a mapped point, across the road, its direction, and w.
 
     `place` is the point and its direction. Without a road within `radius` metres the distance is inf.
     """
@@ -89,7 +89,7 @@ def fit_to_roads(
     holds: NDArray[np.float64],
     roads: RoadBuckets,
 ) -> bool:
-    """Take one Gauss-Newton step that lays road points on the nearest roads of the map; return whether it worked.
+    """Take a Gauss-Newton step that moves road points to the nearest roads of the map; return whether it worked.
 
     Residuals lie across the roads, with Cauchy weights of half the search radius.
 
@@ -177,7 +177,7 @@ def grow_by_roads(
     ps, units, origins : (M, 8), (M,), (M, 2) float64
         As in `fit_to_roads`, of each map. `ps` are adjusted in place.
     tolerances : (M,) float64
-        Points nearer to a road lie on it, metres.
+        Distance within which a point lies on a road, metres.
     points, directions
         As in `fit_to_roads`; points nearest to (0, 0) first.
     closeness : (M,) float64

@@ -1,4 +1,4 @@
-"""The roads of a map as a raster of direction bits, the directions of the roads near a place.
+"""The roads of a map as a raster of direction bits: each cell holds the directions of the roads near it.
 
 Cells of `cell` metres hold 16 bits, one for each of 16 ranges of direction modulo pi. A road sets the bits of its own
 and the nearest directions in all cells near it, so that one look-up answers "does a road pass here that runs my way?".
@@ -118,7 +118,7 @@ def measure_tiles(raster: Raster, out: Singles2) -> None:
     Parameters
     ----------
     out : (rows, columns) float32
-        Filled; the chance of a point that falls there, of any direction, to meet a road.
+        Filled: the chance that a point there, of any direction, meets a road.
     """
     tile_of, bits = raster.tile_of, raster.bits
     share = np.zeros(bits.shape[0])

@@ -1,4 +1,4 @@
-"""One query intersection and the roads around it, laid on intersections of the map (see `matching.road_votes`)."""
+"""A query intersection and the roads around it, compared with intersections of the map (see `matching.road_search`)."""
 
 import math
 from typing import NamedTuple
@@ -18,7 +18,7 @@ __all__ = ["MAX_TURNS", "WHOLE_TURN", "Places", "RoadPoints", "Trial", "find_tur
 WHOLE_TURN = 1 << 32
 _HALF_TURN, _MASK, _BITS = 1 << 31, (1 << 32) - 1, 26
 _UNIT = 2.0 * math.pi / WHOLE_TURN
-#: Turns of one intersection on another at most, and how close two are the same.
+#: Most turns of an intersection to another, and the difference below which two turns are the same.
 MAX_TURNS = 16
 _SAME_TURN = round(0.17 / _UNIT)
 #: Chance rates lie no lower than this.
@@ -54,7 +54,7 @@ class RoadPoints(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """The share of points that meet roads in the right place, and by chance, in units of the density of roads there."""
+    """Share of points that meet roads at the right place, and by chance, in units of the density of roads there."""
 
     hit_rate: float
     chance: float
@@ -74,7 +74,7 @@ def _bearing(angle: int) -> int:
 
 @kernel(forceinline=True)
 def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: int) -> np.uint64:
-    """Return, as bits, turns by whole bearings that may lay enough branches on others: all that do are among them."""
+    """Return, as bits, the turns by whole bearings that may align enough branches: a superset of those that do."""
     branches = np.uint64(0)
     for t in range(m):
         branches |= np.uint64(1) << np.uint64(_bearing(int(directions[j, t])))
@@ -94,9 +94,9 @@ def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: 
 
 @kernel(writes=("turns",))
 def find_turns(rays: Ints1, directions: Int32s2, counts: Ints1, j: int, tolerance: int, turns: Ints1) -> int:
-    """List the turns that lay all branches of a query intersection on branches of map intersection j, or the reverse.
+    """List the turns that align all branches of a query intersection with branches of map intersection j, or reverse.
 
-    The poorer of the two may lack branches, but not have others.
+    The intersection with fewer branches may lack branches, but may not have others.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def find_turns(rays: Ints1, directions: Int32s2, counts: Ints1, j: int, toleranc
     directions : (M, R') int32
         Directions of the map's branches; the first `counts` (M,) of a row are valid.
     tolerance : int
-        How far branches may be apart.
+        Greatest angle between branches that agree.
     turns : (MAX_TURNS,) int64
         Filled with counterclockwise turns, at most half a turn either way: means over the branches that agree. Turns
         close to a turn listed before are left out.
@@ -113,7 +113,7 @@ def find_turns(rays: Ints1, directions: Int32s2, counts: Ints1, j: int, toleranc
     Returns
     -------
     int
-        How many.
+        Number of turns.
     """
     n, m, n_rays = 0, counts[j], rays.shape[0]
     least = max(2, min(n_rays, m))
@@ -180,7 +180,7 @@ def vote(
     votes: Floats2,
     kept: int,
 ) -> tuple[int, int]:
-    """Lay the roads around a query intersection on those around map intersections; keep the best.
+    """Compare the roads around a query intersection with the roads around map intersections; keep the best.
 
     Each turn that the branches allow is tried at every scale, and the best scale of each turn counts. The score is the
     number of points that meet roads, less the number expected by chance if the rings of the place were turned at
@@ -290,7 +290,7 @@ def improve_votes(
     raster: Raster,
     trial: Trial,
 ) -> None:
-    """Move the turn and scale of each proposal in small steps, with more points, and judge it anew.
+    """Vary the turn and scale of each proposal in small steps, with more points, and score it anew.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ def nearest_road(
 
 @kernel(forceinline=True)
 def _carry(matrix: Floats2, u: float, v: float, du: float, dv: float) -> tuple[bool, float, float, float, float]:
-    """Map a point and a unit vector along its road: whether that has a direction this side of the horizon, and both."""
+    """Map a point and a unit vector along its road; return whether it lies this side of the horizon, and both."""
     w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
     if w <= 0.0:
         return False, 0.0, 0.0, 0.0, 0.0
@@ -178,7 +178,7 @@ def road_residuals(
     roads: RoadBuckets,
     out: Floats2,
 ) -> int:
-    """Find how far each road point of the query lies from a road of the map that runs its way; return how many do.
+    """Find the distance of each road point of the query from a map road in its direction; return how many meet one.
 
     Parameters
     ----------
@@ -191,8 +191,8 @@ def road_residuals(
     min_cos
         As in `nearest_road`.
     out : (S, 3) float64
-        Filled: the way from the point to the road, metres, and the unit vector in which it is counted; NaN where there
-        is no road, or the point lies beyond the horizon.
+        Filled: the distance from the point to the road, metres, and the unit vector along which it is measured; NaN
+        without a road, or for a point beyond the horizon.
     """
     met = 0
     for i in range(points.shape[0]):
@@ -271,7 +271,7 @@ def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos:
 def _lies_beside(
     inverse: Floats2, grid: tuple[float, float, float], column: int, row: int, right: float, bottom: float
 ) -> bool:
-    """Whether a bucket lies wholly beyond one side of the frame, of which (0, 0) and (right, bottom) are corners."""
+    """Return whether a bucket lies wholly beyond a side of the frame with corners (0, 0) and (right, bottom)."""
     left, beyond, above, below = 0, 0, 0, 0
     for k in range(4):
         x, y = grid[0] + (column + k % 2) * grid[2], grid[1] + (row + k // 2) * grid[2]
@@ -322,7 +322,7 @@ def count_residuals(
     radius, min_cos
         As in `nearest_road`: metres.
     step : float
-        The map is sampled once in this number of metres of road.
+        Distance between samples along the map's roads, metres.
     field : (h, w) float32
         Distance from each cell of the frame to the nearest road of the query, in cells of `field_scale` pixels; rows
         run downwards.
@@ -412,7 +412,7 @@ def screen(
     roads: RoadBuckets,
     shares: Floats1,
 ) -> None:
-    """Find which part of the query's roads around an anchor lies on roads of the map, under each proposal.
+    """Find the share of the query's road points around an anchor that lie on roads of the map, for each proposal.
 
     Parameters
     ----------
@@ -431,7 +431,7 @@ def screen(
     least : float
         A proposal is given up, with share 0, once it cannot reach this share.
     shares : (M,) float64
-        Filled; 1 where there are no points, for then nothing speaks against a proposal.
+        Filled; 1 without points, for then no point contradicts a proposal.
     """
     n = points.shape[0]
     for m in range(references.shape[0]):

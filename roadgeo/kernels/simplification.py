@@ -15,9 +15,9 @@ __all__ = ["close_pairs", "draw_together", "find_cuts", "join_chains", "measure_
 
 @kernel()
 def join_chains(n_nodes: int, edges: Int32s2, offsets: Ints1, coords: Floats2) -> tuple[Int32s2, Floats2, Ints1]:
-    """Make one edge of every chain of edges whose inner nodes have degree two; nodes keep their numbers.
+    """Join every chain of edges whose inner nodes have degree two into an edge; nodes keep their numbers.
 
-    Rings without any other node stay as one loop at an arbitrary node of theirs. Returns edges, coords and offsets.
+    A ring without other nodes becomes a loop at an arbitrary node of it. Returns edges, coords and offsets.
     """
     n_edges = len(edges)
     degree = np.zeros(n_nodes, np.int64)

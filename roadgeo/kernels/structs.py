@@ -106,13 +106,13 @@ class GrowthQuery(NamedTuple):
     xy: Floats2  # (N, 2)
     branches: Int8s3  # (N, R, 2)
     neighbours: Int32s2  # (N, K)
-    order: Ints1  # points by distance from the anchor: all of them or the nearest, the others are left out
+    order: Ints1  # points by distance from the anchor: all of them, or the nearest
     half_size: float  # of the frame, pixels
     anchor: int
 
 
 class GrowthLimits(NamedTuple):
-    """How growth goes on, and when it gives up."""
+    """Options of growth."""
 
     sigma: tuple[float, float]  # standard deviation of a matched intersection: metres of the map, pixels of the query
     radius: tuple[float, float]  # greatest search radius, likewise
@@ -172,7 +172,7 @@ class Met(NamedTuple):
 
 
 class AdjustLimits(NamedTuple):
-    """How an adjustment goes on.
+    """Options of an adjustment.
 
     Where fewer than `least_share` of a cell's searched points meet a road, they meet it by chance, and the cell
     waits. The iteration ends when no parameter moves by more than `tolerance_m`.

@@ -95,7 +95,7 @@ def rethin(
     min_end_depth: float,
     keep_pairs: bool,
 ) -> Int32s1:
-    """Delete what is simple among `pixels` until nothing is, in place; return the pixels left.
+    """Delete simple pixels among `pixels` until none is left, in place; return the pixels left.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def rethin(
     min_end_depth : float
         A free end of a line is kept where the road is at least this deep: bumps on its edge leave no hairs.
     keep_pairs : bool
-        In the first round, keep free ends of lines two pixels wide, too: else those would be eaten from end to end.
+        Keep free ends of lines two pixels wide in the first round, too: else such lines would vanish from their ends.
     """
     flat = states.ravel()
     depth = distance.ravel()

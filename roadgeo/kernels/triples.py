@@ -92,7 +92,7 @@ def count_alike(
 ) -> None:
     """Fill `costs[i, s, t]` with the number of table entries in the cells of a triple (anchors[i], slot s, slot t).
 
-    -1 where there is no such triple. It shows how common a triple is on the map: cheap ones are looked up first.
+    -1 without such a triple. The cost measures how common a triple is on the map: cheap triples are looked up first.
     """
     codes = np.empty((3, limit, 3), np.int64)
     n = np.empty(3, np.int64)
@@ -302,10 +302,10 @@ def _list_probes(
 def _find_cells(
     listed: NDArray[np.int64], m: int, starts: NDArray[np.int32], entries: NDArray[np.uint64], ends: NDArray[np.int64]
 ) -> None:
-    """Fill `ends` (m + 1, 2) with where the listed cells' entries start and end, and touch the first of each.
+    """Fill `ends` (m + 1, 2) with the starts and ends of the listed cells' entries, and touch the first of each.
 
-    Cells lie all over the table. Here no load waits for another, so that processors overlap them; where each is read
-    when it is compared, most of the time of a look-up is spent waiting.
+    Cells lie all over the table. Here no load waits for another, so processors overlap the loads. Without this, a
+    look-up would spend most of its time waiting for each entry.
     """
     for i in range(m):
         ends[i, 0] = starts[listed[i, 0]]
@@ -424,7 +424,7 @@ def gather(
         while stop < order.shape[0] and hit_ids[order[stop], 0] == a:
             stop += 1
         if stop - start >= 2 and n < out_score.shape[0]:
-            # the hit with which most others agree
+            # the hit with most agreement
             best = 2
             size = min(stop - start, 200)
             for i in range(start, start + size):
@@ -436,7 +436,7 @@ def gather(
                 partner[hit_ids[u, 3]] = hit_ids[u, 4]
                 placed = 2
                 m00, m01, m10, m11, m = 0.0, 0.0, 0.0, 0.0, 0
-                # those whose maps are alike, and that send no shared neighbour elsewhere
+                # hits with similar maps that send no shared neighbour elsewhere
                 for j in range(start, start + size):
                     v = order[j]
                     d00 = hit_affine[v, 0] - hit_affine[u, 0]

@@ -1,4 +1,4 @@
-"""Kernels are made ready here, before any clock runs: compiled once per machine, loaded once per process."""
+"""Prepare kernels before any clock runs: they are compiled once per machine and loaded once per process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KEPT_DAYS = 30.0
 
 
 def warm_up(say: Say = say_nothing) -> None:
-    """Load the machine code of the search, after compiling what this machine has none of.
+    """Load the machine code of the search; compile it first where this machine lacks it.
 
     It is cheap to call again. `say` is called for compilation only.
     """
