@@ -168,6 +168,8 @@ def _list_places(
 
     All that may be taken are described whole.
     """
+    if not candidates:
+        return ()
     further = _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.further], candidates)
     places = []
     for number, one in enumerate([*candidates, *further][:N_PLACES], 1):

@@ -241,3 +241,9 @@ def test_half_a_place_is_not_located(query, searched, along_m, status):
         assert answer.reason.startswith("only half a place is known: the middle lies within +-200 m along 90 degrees")
         assert answer.center is not None
         assert answer.to_dict()["center_error"]["along_m"] == pytest.approx(100.0, rel=0.01)
+
+
+def test_places_that_are_only_shown_make_no_answer(query, searched):
+    found = searched("a", (5.0, 0.0))
+    refused = judge(query, replace(found, fits=(), further=found.fits))
+    assert (refused.status, refused.alternatives) == ("not_located", ())
