@@ -35,7 +35,7 @@ from roadgeo.storage.memory import let_pages_go
 __all__ = ["N_PLACES", "Fit", "Found", "search_references"]
 
 
-#: Work that a first look at coarse maps may take.
+#: Limit of work for a first look at coarse maps, seconds.
 _FIRST_LOOK_S = 0.03
 #: Places that a refusal lists at most.
 N_PLACES = 5
@@ -52,15 +52,15 @@ class Fit:
     matrix : (3, 3) float64
         Query plane to reference plane.
     matched, distance : (N,) int, (N,) float64
-        Intersection of `index` that each of the query's is, or -1, and metres between them.
+        Intersection of `index` that matches each query intersection, or -1, and the distance between them, metres.
     agreeing : float
         Share of the query's roads that agree.
     log10_odds : float
-        By which the place leads any other; NaN where the method knows none.
+        Lead of the place over any other; NaN if the method has no scores.
     log10_likelihood, statement_px : float
         See `evidence`.
     corner_sigma_m, corner_covariance_m2, lens_k1
-        As of `Refined`.
+        See `Refined`.
     agreement : float
         Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
     """
@@ -80,7 +80,7 @@ class Fit:
 
     @property
     def explained(self) -> float:
-        """What compares it with places of other scales (see `evidence.statement_px`)."""
+        """Likelihood, scaled so that places of different scale compare (see `evidence.statement_px`)."""
         return self.log10_likelihood * self.statement_px
 
 
@@ -93,14 +93,14 @@ class Found:
     index : ReferenceIndex
         The whole reference.
     fits : tuple of Fit
-        The likeliest place, and the best other one, as far as there are any: the answer rests on them.
+        The likeliest place and its best rival, if they exist: the answer is based on them.
     stopped : str
-        As in `Search`; "" where nothing was searched.
+        As in `Search`; "" if no map was searched.
     said : str
         The method's own sentence on the result.
     n_searched, n_tried, n_anchors : int
-        Intersections of the part of the reference that was searched, places that were screened, and intersections of
-        the query that were looked for.
+        Intersections of the part of the reference that was searched, places screened, and intersections of the query
+        that were looked up.
     further : tuple of Fit
         Other verified places, the best first: they are shown, no more.
     """
@@ -128,9 +128,9 @@ def search_references(
 ) -> list[Found]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
-    Those that cannot hold the place are not opened, unless that is none of them; they have no result. Coarse
-    maps come first: where a place stands out on them, the others are not opened. Where it is to be `explained`, events
-    are kept.
+    Parts that cannot contain the place are not opened, and have no result; if no part can, the first is opened. Coarse
+    maps come first: if a place stands out on them, the others are not opened. Events are kept if the search is to be
+    `explained`.
     """
     coarse, fine = _split(parts, options)
     with Ahead(options.threads) as ahead:
@@ -154,7 +154,7 @@ def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], l
 
 
 def _at_first_look(coarse: Sequence[Part], options: LocateOptions) -> LocateOptions:
-    """Return the options for a look at coarse maps alone: a quick one, unless pixels are as large as they show."""
+    """Return the options for a search of coarse maps alone: a quick search, unless pixels are large enough for them."""
     least_m = options.match.camera.gsd_m[0]
     if all(least_m >= one.coarseness * COARSE_PIXEL_M for one in coarse):
         return options
@@ -199,19 +199,19 @@ def _search(
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
-    """Open the parts that may hold a place; the first where none does, to report that."""
+    """Open the parts that may contain the place, or else the first, to report that."""
     able = [part for part in parts if may_show(part, options, frame_m)]
     return [part.open() for part in able or parts[:1]]
 
 
 def may_show(part: Part, options: LocateOptions, frame_m: float) -> bool:
-    """Whether a part may show a frame of that size at most, as far as the user knows where; it is not opened."""
+    """Return whether a frame of at most this size may lie on a part, given the user's hints; opens nothing."""
     near, within = options.near, options.match.within
     return (near is None or part.may_hold(near, frame_m)) and (within is None or part.touches(within))
 
 
 def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
-    """Whether hypotheses on two parts mean one place."""
+    """Return whether hypotheses on two parts are the same place."""
     places = [
         to_lonlat(estimator.index.plane.crs, estimator.index.plane.to_crs(estimator.center(model)[None]))[0]
         for estimator, model in ((one, a), (other, b))
@@ -220,7 +220,7 @@ def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b:
 
 
 def _same_place(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
-    """Whether hypotheses on two shards of one map mean one place."""
+    """Return whether hypotheses on two shards of a map are the same place."""
     shard_of = one.index.meta.get("shard_of")
     return bool(shard_of) and shard_of == other.index.meta.get("shard_of") and _same_ground(one, a, other, b)
 
@@ -233,7 +233,7 @@ def _begin(
     ledger: Ledger,
     sweeps: SharedSweeps,
 ) -> tuple[Found, TripleEstimator | None]:
-    """Return a result without places, and what searches for them, unless none can be near the place that was given."""
+    """Return a result without places, and the estimator, or None if the reference has no intersection near the hint."""
     part, near, within = index, _near(index, options.near), options.match.within
     if within is not None and not Whole(index).touches(within):
         return Found(index, events=events), None
@@ -247,7 +247,7 @@ def _begin(
 
 
 def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], rivals: Rivals, scale: float) -> Found:
-    """Return the result with its places; work is that on a map `scale` times smaller."""
+    """Return the result with its places; work is divided by `scale`, as on a map of usual size."""
     standing = rivals.standing(search)
     if found.events.kept:
         found.events.result = search
@@ -269,7 +269,7 @@ def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], r
 
 
 def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
-    """Return the likeliest place, and the best other one."""
+    """Return the likeliest place and its best rival."""
     model, lead = standing.model, standing.log10_lead
     measure_corners(estimator, model, lead)
     fits = [_fit(estimator, model, lead)]
@@ -320,14 +320,14 @@ def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | No
 
 
 def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, likelihood: float) -> Fit:
-    """Return the best other place."""
+    """Return the best rival as a fit."""
     scene, index = estimator.scene, estimator.index
     found, matched, distance = agreement(matrix, scene, index)
     return Fit(index, matrix, matched, distance, found.forward, lead, likelihood, agreement=found.mean)
 
 
 def _of_effort(options: LocateOptions) -> MatchOptions:
-    """Return the options of matching; where effort is low roads do not propose."""
+    """Return the options of matching; with low effort roads do not propose."""
     match = options.match
     return match if options.effort == "full" else replace(match, roads=False)
 
@@ -341,13 +341,13 @@ def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tup
 
 
 def _rounded_up(radius_m: float) -> float:
-    """Return the next step of a ladder, so that masks of many sizes are looked for on a few parts of a map."""
+    """Round up to a power of 1.25, so that masks of many sizes are searched on few different parts of a map."""
     return float(1.25 ** math.ceil(math.log(radius_m) / math.log(1.25)))
 
 
 @lru_cache(maxsize=32)
 def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
-    """Crop a reference to a circle, unless it hardly reaches beyond: made once for a batch."""
+    """Crop a reference to a circle, unless it hardly extends beyond; kept for a batch."""
     inside = np.hypot(*(index.xy - center).T) <= radius_m
     return crop(index, center, radius_m) if inside.mean() < 0.7 else index
 
@@ -358,7 +358,7 @@ def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -
 def _search_pairs_in_turn(
     query: Query, indexes: Sequence[ReferenceIndex], options: LocateOptions, time_s: float
 ) -> list[Found]:
-    """Search one reference after another; each gets an even share of the work and the time that are left."""
+    """Search the references in turn; each gets an even share of the work and the time that are left."""
     found: list[Found] = []
     pair = options.pair
     work_s, time_s = min(pair.work_limit_s, options.search.work_limit_s), min(pair.time_limit_s, time_s)
@@ -371,7 +371,7 @@ def _search_pairs_in_turn(
 
 
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, share: PairOptions) -> Found:
-    """Run the paper's method, within a share of its limits: its places have no odds, for it knows none."""
+    """Run the paper's method within a share of its limits; its places have no scores."""
     scene = query.scene
     table = _pair_index(index, options)
     match = match_pairs(scene.intersections, table, scene.corners, share)

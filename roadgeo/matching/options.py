@@ -21,19 +21,18 @@ class LocateOptions:
     method : "auto" or "pair"
         Triples of intersections, or the paper's pairs.
     near : (lon, lat, radius in metres) or None
-        The middle of the frame is known to lie there.
+        Circle that is known to contain the middle of the frame.
     min_log10_odds : float
-        Powers of ten by which a place must explain more than any other place to be reported as located.
+        Score (log10) by which a place must lead any other place to be reported as located.
     min_margin : float
-        The same, against a place that another look at the scene found.
+        The same, over a place that another variant of the query found.
     truths : tuple of (str, lon, lat)
-        For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
-        look at it.
+        For explanations: true middle of the frame of masks whose names end with the text. The search does not use it.
     effort : "quick" or "full"
-        Whether roads alone propose places where triples of intersections lead nowhere: a second or two on the map of a
-        city.
+        "full": roads alone propose places if triples of intersections lead to none, in a second or two on the map of a
+        city. "quick": they do not.
     threads : int
-        Of the search for one mask. The answer does not depend on it.
+        Threads of the search for a mask. The answer does not depend on their number.
     take : int or None
         Where nothing is located: the place, counted from 1 among those that the refusal lists, that is the answer.
     """

@@ -1,4 +1,4 @@
-"""Located, ambiguous or refused: the places found on all references are judged once, together."""
+"""Located, ambiguous or refused: the places found on all references are judged together, once."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from roadgeo.matching.scene import Query, Scene
 __all__ = ["center_of", "decide", "place_frame"]
 
 
-#: Reason where the clock ended a search: the one case in which an answer depends on the machine and its load.
+#: Reason if the clock ended a search: the only case in which an answer depends on the machine and its load.
 _CUT_SHORT = "so that another run may tell otherwise"
 
-#: Mean share of intersections and roads that agree as at the true place of a good mask.
+#: Mean share of intersections and roads that agree at the true place of a good mask.
 _LIKE_THE_TRUTH = 0.85
 
-#: A place is half a one where the standard deviation of its middle is more than this share of the frame's side. Of
-#: located photographs it is .0001 to .003; frames that are almost wholly void had up to .09 and lay 52 m off.
+#: A place is only half known if the standard deviation of its middle exceeds this share of the frame's side. The share
+#: is .0001 to .003 for located photographs; for frames almost without roads it was up to .09, and they lay 52 m off.
 _MOST_UNSURE = 0.03
 
-#: A similarity agrees with as many of the query's roads as the homography but for this share, or it is none.
+#: A similarity replaces the homography if it loses at most this share of the query's roads.
 _LEAST_LOST = 0.02
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A place, the reference it lies on, and its odds against all places that were tried on any reference."""
+    """A place, its reference, and its lead over all places that were tried on any reference."""
 
     found: Found
     fit: Fit
@@ -67,7 +67,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
 
 
 def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
-    """Compare the places with each other and with the thresholds; describe the best, or why there is none."""
+    """Compare the places with each other and with the thresholds; describe the best, or the reason for a refusal."""
     location = _describe_work(query, found)
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
@@ -126,7 +126,7 @@ def _describe_work(query: Query, found: Sequence[Found]) -> Location:
 
 
 def _ended_by(found: Sequence[Found]) -> str:
-    """Return why a search of one or more parts ended: an answer, a limit, or that nothing was left to try."""
+    """Return why a search of one or more parts ended: an answer, a limit, or nothing left to try."""
     ends = {one.stopped for one in found}
     return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
@@ -137,9 +137,9 @@ def _on(location: Location, found: Found) -> Location:
 
 
 def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
-    """Return the places of all references, the best first; where parts overlap, each once.
+    """Return the places of all references, the best first; a place on overlapping parts occurs once.
 
-    Of places on different references the likelier one is the best.
+    Places on different references are ranked by likelihood.
     """
     return _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.fits])
 
@@ -183,7 +183,7 @@ def _list_places(
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
-    """Whether two candidates are different places: of one part always, of two if they lie too far apart to be one."""
+    """Return whether two candidates are different places: on the same part always, else if they are too far apart."""
     if a.found is b.found:
         return True
     places = [np.array([one.center.lon, one.center.lat]) for one in (a, b)]
@@ -200,17 +200,17 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
 
 
 def _against(best: _Candidate, rivals: Sequence[_Candidate]) -> _Candidate:
-    """Return a place with the odds by which it leads also those on other references."""
+    """Return a place with its lead over the places on all references."""
     leads = [best.fit.explained - one.fit.explained for one in rivals if one.found is not best.found]
     odds = min([best.score, *(lead / best.fit.statement_px for lead in leads)])
     return replace(best, fit=replace(best.fit, log10_odds=odds), center=replace(best.center, log10_odds=odds))
 
 
 def _equal(best: _Candidate, rivals: Sequence[_Candidate], needed: float) -> _Candidate | None:
-    """Return a rival that makes the best place ambiguous, if there is one.
+    """Return a rival that makes the best place ambiguous, or None.
 
-    On its own map that is one that agrees so well, as the best does, that only streets that repeat explain it; on
-    another, one that the best place would be reported without.
+    If no place would be reported, that is a rival that agrees as well as the best place where streets repeat. Otherwise
+    it is a rival without which the best place would be reported.
     """
     if best.score < needed:
         return next((one for one in rivals if _are_alike(best, one)), None)
@@ -218,7 +218,7 @@ def _equal(best: _Candidate, rivals: Sequence[_Candidate], needed: float) -> _Ca
 
 
 def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
-    """Whether two places agree so well, both, that only streets that repeat explain it, however low their odds are."""
+    """Return whether both places agree so well that only repeating streets explain it, whatever their scores."""
     return min(best.fit.agreement, rival.fit.agreement) >= _LIKE_THE_TRUTH
 
 
@@ -248,7 +248,7 @@ def _two_places(best: _Candidate, rival: _Candidate) -> str:
 
 
 def _decide_pairs(location: Location, query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
-    """Report what the paper's method found as found: it knows no odds."""
+    """Report the place that the paper's method found; the method has no scores."""
     best = next((one for one in found if one.fits), None)
     if best is None:
         return _refuse(location, query, found, None, options)
@@ -262,7 +262,7 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
 def _refuse(
     location: Location, query: Query, found: Sequence[Found], best: _Candidate | None, options: LocateOptions
 ) -> Location:
-    """Return why nothing is reported: of several references, for the one that came nearest."""
+    """Describe why nothing is reported, for the reference that came nearest."""
     nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
     score = best.score if best is not None else -math.inf
     code, reason = _why_nothing(query, nearest, score, options)
@@ -281,7 +281,7 @@ def _refuse(
 
 
 def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> tuple[Reason, str]:
-    """Return why nothing is reported, for programs and for people, and the remedy."""
+    """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
         return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
     if found.said:
@@ -313,19 +313,19 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
 
 
 def _lead(log10_odds: float) -> str:
-    """Return how much likelier a place is than the best other one."""
+    """Describe how much likelier a place is than its best rival."""
     return "no likelier than" if log10_odds < 0.2 else f"only {_times(log10_odds)} as likely as"
 
 
 def _times(log10_odds: float) -> str:
-    """Write a factor with two digits, one where it is large: "2.5 times", "3,000 times"."""
+    """Write a factor with two digits, or a single digit if it is large: "2.5 times", "3,000 times"."""
     factor = 10.0**log10_odds
     digits = 1 if factor < 10 else -math.floor(log10_odds)
     return f"{round(factor, digits):,.{max(digits, 0)}f} times"
 
 
 def _how_far(query: Query, found: Found, options: LocateOptions) -> str:
-    """Describe how far a search got that was cut short, and the hints that would shorten it."""
+    """Describe the progress of a search that was cut short, and hints that would shorten it."""
     far = f"{found.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
     (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
     if (low, high) == usual:
@@ -337,7 +337,7 @@ def _how_far(query: Query, found: Found, options: LocateOptions) -> str:
 
 
 def searched_within(options: LocateOptions) -> str:
-    """Name the limits that the search was given, to end a sentence; "" for none."""
+    """Name the limits of the search, as the end of a sentence; "" without limits."""
     camera, usual = options.match.camera, CameraOptions()
     limits = []
     if options.near is not None:
@@ -365,7 +365,7 @@ def searched_within(options: LocateOptions) -> str:
 
 def place_frame(location: Location, query: Query, fit: Fit, options: MatchOptions) -> Location:
     """Fill in everything that follows from a fit's homography and its matches."""
-    # Where the corners and the middle lie, in the map's CRS.
+    # The corners and the middle in the map's CRS.
     plane, scene = fit.index.plane, query.scene
     frame = Frame(*scene.size)
     level = _level(fit, query)
@@ -378,7 +378,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0
     reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
-    # That of the camera is the covariance of all eight parameters: the pose of one that looks straight down has six.
+    # The camera's covariance comes from all eight parameters: the pose of a camera that looks straight down has six.
     seat = _find_camera(fit, level.matrix, scene.size, focal_px, north)
     odds = 0.0 if math.isnan(fit.log10_odds) else fit.log10_odds
     return replace(
@@ -414,7 +414,7 @@ def _level(fit: Fit, query: Query) -> Fit:
     if found is None:
         return fit
     matrix, covariance = found.matrix, found.corner_covariance + found.doubt
-    # The covariance may be too cautious. Roads that agreed must go on to agree.
+    # The covariance may be too large. Roads that agreed must still agree.
     agreeing, _, _ = agreement(matrix, scene, fit.index)
     if not agreeing.forward >= fit.agreeing - _LEAST_LOST:
         return fit
@@ -424,7 +424,7 @@ def _level(fit: Fit, query: Query) -> Fit:
 def _find_camera(
     fit: Fit, matrix: FloatArray, size: tuple[int, int], focal_px: float | None, north: float
 ) -> Camera | None:
-    """Return where the camera was, given the `matrix` of a fit, levelled or not.
+    """Return the camera of a fit's `matrix`, levelled or not.
 
     `north` is the direction of the plane's y axis from true north.
     """
@@ -443,7 +443,7 @@ def _find_camera(
 
 
 def center_of(matrix: FloatArray, scene: Scene, plane: LocalPlane, log10_odds: float) -> Place:
-    """Return where the middle of the frame lies."""
+    """Return the middle of the frame as a place."""
     ground = plane.to_crs(Homography(matrix).everywhere(scene.center)[None])
     lonlat = to_lonlat(plane.crs, ground)
     return _place(ground[0], lonlat[0], log10_odds)
