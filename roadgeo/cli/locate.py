@@ -365,7 +365,7 @@ def _details(document: dict[str, Any]) -> str:
     stats = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in document["stats"].items())
     lines = [f"seconds: {seconds}", stats]
     if document["log10_odds"] is not None:
-        lines.append(f"log10 odds against any other place: {document['log10_odds']:.2f}")
+        lines.append(f"score (log10): {document['log10_odds']:.2f}")
     if document["center"] is None and document["alternatives"]:
         best = document["alternatives"][0]["center"]
         lines.append(f"the best place, not sure enough: {format_lonlat(best['lon'], best['lat'])}")

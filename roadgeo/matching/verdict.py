@@ -95,7 +95,7 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return replace(placed, status="ambiguous", reason=half + cut, reason_code=Reason.HALF_A_PLACE)
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
-        f"; odds 10^{best.score:.1f} against any other place{cut}"
+        f"; score {best.score:.1f}{cut}"
     )
     return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
 
@@ -290,10 +290,7 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     if found.n_searched == 0 and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
         return Reason.FEW_NEAR, f"the map has {counted(found.n_searched, 'intersection')} {given}{searched}"
-    if math.isfinite(score):
-        best = f"the best is {_lead(score)} another, where {_times(options.min_log10_odds)} are asked for"
-    else:
-        best = "none fits"
+    best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if found.stopped == "work":
         told = f"stopped after as much work as a search may take; of the places tried, {best}{searched}"
         return Reason.TIME_LIMIT, f"{told}; {_how_far(query, found, options)}"
@@ -312,16 +309,11 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     return Reason.NOTHING_STANDS_OUT, f"{nothing}{advice}"
 
 
-def _lead(log10_odds: float) -> str:
-    """Describe how much likelier a place is than its best rival."""
-    return "no likelier than" if log10_odds < 0.2 else f"only {_times(log10_odds)} as likely as"
-
-
-def _times(log10_odds: float) -> str:
-    """Write a factor with two digits, or a single digit if it is large: "2.5 times", "3,000 times"."""
-    factor = 10.0**log10_odds
-    digits = 1 if factor < 10 else -math.floor(log10_odds)
-    return f"{round(factor, digits):,.{max(digits, 0)}f} times"
+def _lead(score: float, needed: float) -> str:
+    """Describe how far the best place leads."""
+    if score < 0.2:
+        return "another fits as well as the best"
+    return f"the best has a score of {math.floor(10.0 * score) / 10.0:g}, {needed:g} is asked for"
 
 
 def _how_far(query: Query, found: Found, options: LocateOptions) -> str:

@@ -39,7 +39,7 @@ def png(rows: np.ndarray, *chunks: tuple[bytes, bytes]) -> bytes:
 
 def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_streets(tmp_path / "a.gpkg")
-    index = ["index", "--roads", "a.gpkg", "--out", "b.gpkg", "-q", "--crs"]
+    index = ["index", "--roads", "a.gpkg", "--out", "b.gpkg", "--replace", "-q", "--crs"]
     assert main([*index, "EPSG:4258"]) == 0
     assert "a.gpkg: says that its CRS is EPSG:4326; read as EPSG:4258, as --crs asks" in caplog.text
     caplog.clear()

@@ -170,7 +170,7 @@ _LOCATION_OUTPUTS = {
     "LATITUDE": (QgsProcessingOutputNumber, "Latitude of the middle"),
     "GSD": (QgsProcessingOutputNumber, "Pixel size, metres"),
     "ROTATION": (QgsProcessingOutputNumber, "Heading of the top, degrees clockwise from north"),
-    "LOG10_ODDS": (QgsProcessingOutputNumber, "Odds against any other place, decimal logarithm"),
+    "LOG10_ODDS": (QgsProcessingOutputNumber, "Score, powers of ten"),
     "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
     "LOCATION": (QgsProcessingOutputVectorLayer, "Footprint, matched intersections, roads"),
     "REPORT_PAGE": (QgsProcessingOutputFile, "Report"),
