@@ -149,8 +149,9 @@ def test_the_same_plugin_is_the_same_package(package: Path, tmp_path: Path) -> N
 def test_the_package_brings_roadgeo_for_an_environment_of_its_own(package: Path, tmp_path: Path) -> None:
     """pip finds roadgeo at no index, and takes the wheel that lies in the plugin."""
     (wheel,), site = (package.parent / NAME).glob("*.whl"), tmp_path / "site"
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", f"--target={site}", str(wheel)]
-    assert subprocess.run(install, check=False).returncode == 0
+    pip = [sys.executable, "-I", "-m", "pip"]  # a checkout that another test builds is none of its packages
+    install = [*pip, "install", "-q", "--no-deps", "--no-index", f"--target={site}", str(wheel)]
+    assert subprocess.run(install, cwd=tmp_path, check=False).returncode == 0
     here = {path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.*") if path.suffix != ".pyc"}
     assert here <= {path.relative_to(site) for path in site.rglob("*.*")}
     assert (site / "bin" / "roadgeo").is_file()

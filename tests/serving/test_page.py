@@ -153,6 +153,7 @@ def hard(monkeypatch):
 
 
 def give(page, path, name=None):
+    expect(page.locator("#work")).to_be_visible(timeout=PATIENCE_MS)  # as a person sees it: it knows its maps
     page.set_input_files("#files", {"name": name or path.name, "mimeType": "image/png", "buffer": path.read_bytes()})
 
 
