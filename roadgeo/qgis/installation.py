@@ -90,8 +90,9 @@ def _make_wheel() -> dict[str, bytes]:
     distribution = metadata.distribution("roadgeo")
     stem, root = f"roadgeo-{distribution.version}", Path(roadgeo.__file__).parent
     files = {f"roadgeo/{file.as_posix()}": content for file, content in _read_folder(root).items()}
-    for name in ("METADATA", "entry_points.txt"):
-        files[f"{stem}.dist-info/{name}"] = (distribution.read_text(name) or "").encode()
+    described = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")  # that of a checkout
+    for name, text in (("METADATA", described), ("entry_points.txt", distribution.read_text("entry_points.txt"))):
+        files[f"{stem}.dist-info/{name}"] = (text or "").encode()
     files[f"{stem}.dist-info/WHEEL"] = (
         b"Wheel-Version: 1.0\nGenerator: roadgeo\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     )
