@@ -162,7 +162,8 @@ def _streets(path: str) -> tuple[STRtree, AnyArray]:
     has_name = np.array([bool(name) for name in names], bool)
     lines = shapely.from_wkb(shapes[has_name])
     to_web = transformer(str(layer.crs), "EPSG:3857").transform
-    return shapely.STRtree(shapely.transform(lines, to_web, interleaved=False)), names[has_name]
+    on_web = shapely.transform(lines, lambda xy: np.column_stack(to_web(*xy.T)))
+    return shapely.STRtree(on_web), names[has_name]
 
 
 def _encode(lines: list[FloatArray], named: list[tuple[FloatArray, str]]) -> bytes:
