@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from support.readers import READERS, drivers_registered_once, feed, seeds
 
-FILES = [(name, path) for name in READERS if name != "index" for path in seeds(name)]
+FILES = [(name, path) for name in READERS for path in seeds(name)]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -20,4 +20,4 @@ def test_each_is_read_or_refused(name: str, path: Path, tmp_path: Path) -> None:
 
 
 def test_every_reader_has_a_file() -> None:
-    assert {name for name, _ in FILES} == READERS.keys() - {"index"}  # `fuzz_index.py` makes its own
+    assert {name for name, _ in FILES} == READERS.keys()

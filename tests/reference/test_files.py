@@ -1,12 +1,14 @@
 import errno
 import json
 import os
+import random
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 from reference.test_network_file import editing
-from support import kill_writers
 from worlds.networks import grid_network
 
 from roadgeo.errors import IndexFormatError, OutputError
@@ -248,22 +249,46 @@ def test_readers_keep_the_reference_they_opened(path: Path, network: RoadNetwork
     np.testing.assert_array_equal(open_reference(path)[1]["xy"], newer.intersections.xy)
 
 
-@pytest.mark.slow
-def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
-    """Every opening gives one whole reference, while another process replaces it again and again."""
-    path = tmp_path / "REF.gpkg"
-    command = [sys.executable, kill_writers.__file__, "--write", str(path)]
-    known = [as_stored(grid_network(size, size, seed=size)).intersections.xy for size in kill_writers.SIZES]
-    n_opened = {len(xy): 0 for xy in known}
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as writer:
+WRITER = """
+import sys
+from pathlib import Path
+from reference.test_files import parts, two_networks
+from roadgeo.reference.files import write_reference
+networks = two_networks()
+while True:
+    for network in networks:
+        write_reference(Path(sys.argv[1]), network, parts(network))
+        print("written", flush=True)
+"""
+
+
+def two_networks() -> list[RoadNetwork]:
+    return [as_stored(grid_network(size, size, seed=size)) for size in (6, 16)]
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Have another process replace one reference by another again and again; it is killed in the end."""
+    command = [sys.executable, "-c", WRITER, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]) as writer:
         assert writer.stdout is not None
         writer.stdout.readline()
+        yield
+        writer.kill()
+
+
+@pytest.mark.slow
+def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
+    """Every opening gives one whole reference."""
+    path = tmp_path / "REF.gpkg"
+    known = [network.intersections.xy for network in two_networks()]
+    n_opened = {len(xy): 0 for xy in known}
+    with writing(path):
         end = time.monotonic() + 2
         while time.monotonic() < end:
-            meta, arrays = open_reference(path, kill_writers.parts)
+            meta, arrays = open_reference(path, parts)
             assert any(np.array_equal(arrays["xy"], xy) for xy in known)
             n_opened[meta["n"]] += 1
-        writer.kill()
     assert min(n_opened.values()) > 0
 
 
@@ -287,27 +312,6 @@ def test_an_index_that_is_stale_for_a_moment_is_waited_for(path: Path) -> None:
         np.testing.assert_array_equal(open_reference(path)[1]["xy"], newer.intersections.xy)
 
 
-@pytest.mark.slow
-def test_four_processes_read_what_is_replaced_a_hundred_times(tmp_path: Path) -> None:
-    path = tmp_path / "REF.gpkg"
-    networks = [as_stored(grid_network(size, size, seed=size)) for size in kill_writers.SIZES]
-    write_reference(path, networks[0], kill_writers.parts(networks[0]))
-    command = [sys.executable, kill_writers.__file__, "--read", str(path)]
-    readers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
-    try:
-        assert [reader.stdout.readline() for reader in readers if reader.stdout] == ["reading\n"] * 4
-        for n in range(100):
-            write_reference(path, networks[n % 2], kill_writers.parts(networks[n % 2]))
-    finally:
-        (tmp_path / "stop").touch()
-        told = [reader.communicate(timeout=60)[0].split() for reader in readers]
-    assert [reader.returncode for reader in readers] == [0] * 4
-    for torn, small, large in told:
-        assert int(torn) == 0
-        assert int(small)
-        assert int(large)
-
-
 def test_an_index_that_comes_and_goes_while_it_is_opened(
     tmp_path: Path, network: RoadNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -320,7 +324,7 @@ def test_an_index_that_comes_and_goes_while_it_is_opened(
         raise IndexFormatError(f"{file} was replaced while it was read; try again")
 
     monkeypatch.setattr("roadgeo.reference.files.read_network", read_and_lose)
-    np.testing.assert_array_equal(open_reference(path, kill_writers.parts)[1]["xy"], network.intersections.xy)
+    np.testing.assert_array_equal(open_reference(path, parts)[1]["xy"], network.intersections.xy)
 
 
 def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> None:
@@ -330,9 +334,17 @@ def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> Non
 
 
 @pytest.mark.slow
-def test_killed_writers_leave_a_whole_reference() -> None:
-    states = kill_writers.run(count=4, seed=1, command=[])
-    assert states["whole"] + states["index built again"] == 4
+def test_killed_writers_leave_a_whole_reference(tmp_path: Path) -> None:
+    """With its own index or with none; the next writer clears away what they left."""
+    path, rng, networks = tmp_path / "REF.gpkg", random.Random(1), two_networks()
+    for _ in range(4):
+        with writing(path):
+            time.sleep(rng.uniform(0, 0.15))
+        network = read_network(path)
+        assert network_digest(network) in map(network_digest, networks)
+        assert open_reference(path, parts)[0] == parts(network)[0]
+    write_reference(path, networks[0], parts(networks[0]))
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["REF.gpkg", "REF.index"]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs resource limits")

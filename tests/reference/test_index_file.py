@@ -1,14 +1,11 @@
 """The index file: round trip, and every way in which one can be damaged or hostile."""
 
 import errno
-import io
 import json
 import os
 import pickle
 import struct
-import subprocess
-import sys
-from hashlib import blake2b
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -112,14 +109,6 @@ def test_many_values_come_back(tmp_path: Path) -> None:
     meta = {"many": list(range(5000)), "long": "x" * 70000, "keys": {str(i): i for i in range(3000)}}
     write_index(tmp_path / "many.index", meta, {})
     assert read_index(tmp_path / "many.index") == (meta, {})
-
-
-def test_readers_keep_the_file_they_opened(path: Path) -> None:
-    _, before = read_index(path)
-    write_index(path, {}, {"ids": np.zeros(3)})
-    np.testing.assert_array_equal(before["ids"], ARRAYS["ids"])
-    np.testing.assert_array_equal(read_index(path)[1]["ids"], np.zeros(3))
-    assert list(path.parent.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(
@@ -255,36 +244,31 @@ def test_checksum_sees_swapped_words_rows_and_pages() -> None:
     assert index_file._checksum(entry, words.view(np.uint8)[:-1]) != whole
 
 
-@pytest.mark.parametrize("change", [{"name": "b"}, {"dtype": "<i8"}, {"shape": [2, 5]}])
-def test_checksum_sees_a_changed_name_type_or_shape(change: dict[str, Any]) -> None:
-    entry = {"name": "a", "dtype": "<u8", "shape": [10]}
-    words = np.arange(10, dtype=np.uint64)
-    assert index_file._checksum(entry | change, words) != index_file._checksum(entry, words)
-
-
 # --- hostility --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"format": FORMAT_VERSION + 1},
-        {"format": "1"},
-        {"format": True},
-        {"arrays": None},
-        {"arrays": [{}]},
-        {"arrays": [[]]},
-        {"arrays": [{"name": "a"}] * 300},
-        {"size": -1},
-        {"size": 1 << 80},
-        {"size": 0},
-        {"pickle": {}},
-        {"pickle": {"size": 1 << 40, "digest": ""}},
-        {"pickle": {"size": -5, "digest": ""}},
-        {"pickle": {"size": True, "digest": ""}},
-        {"about": []},
-    ],
-)
+MANIFESTS = {
+    "format": [FORMAT_VERSION + 1, "1", True],
+    "arrays": [None, [{}], [[]], [{"name": "a"}] * 300],
+    "size": [-1, 1 << 80, 0],
+    "pickle": [{}, *({"size": size, "digest": ""} for size in (1 << 40, -5, True))],
+    "about": [[]],
+}
+ENTRIES = {
+    "offset": [0, -64, 1, 1 << 70, 64.0, None],
+    "shape": [[1 << 61], [1 << 31, 1 << 31], [-1], [1] * 5, [1.5], [True], "12", None, [2, 150]],
+    "dtype": ["|O", "O", "<U9", ">f8", "V8", ["<f8"], {"a": "<f8"}, "|b1", "<i2", "<f4", "<u8"],
+    "name": ["flags", 3, "other"],
+    "checksum": [3],
+    "digest": [None],
+}
+
+
+def changes(table: dict[str, list]) -> list[dict[str, Any]]:
+    return [{key: value} for key, values in table.items() for value in values]
+
+
+@pytest.mark.parametrize("change", changes(MANIFESTS))
 def test_forged_manifests_are_refused(path: Path, change: dict[str, Any]) -> None:
     manifest, data = sections(path)
     forge(path, manifest | change, data)
@@ -292,39 +276,7 @@ def test_forged_manifests_are_refused(path: Path, change: dict[str, Any]) -> Non
         read_index(path)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"offset": 0},
-        {"offset": -64},
-        {"offset": 1},
-        {"offset": 1 << 70},
-        {"offset": 64.0},
-        {"offset": None},
-        {"shape": [1 << 61]},
-        {"shape": [1 << 31, 1 << 31]},
-        {"shape": [-1]},
-        {"shape": [1] * 5},
-        {"shape": [1.5]},
-        {"shape": [True]},
-        {"shape": "12"},
-        {"shape": None},
-        {"dtype": "|O"},
-        {"dtype": "O"},
-        {"dtype": "<U9"},
-        {"dtype": ">f8"},
-        {"dtype": "V8"},
-        {"dtype": ["<f8"]},
-        {"dtype": {"a": "<f8"}},
-        {"dtype": "|b1"},
-        {"dtype": "<i2"},
-        {"dtype": "<f4"},
-        {"name": "flags"},
-        {"name": 3},
-        {"checksum": 3},
-        {"digest": None},
-    ],
-)
+@pytest.mark.parametrize("change", changes(ENTRIES))
 @pytest.mark.parametrize("which", [0, 3])
 def test_forged_array_entries_are_refused(path: Path, change: dict[str, Any], which: int) -> None:
     manifest, data = sections(path)
@@ -377,12 +329,6 @@ def test_a_pickle_that_calls_is_refused_and_calls_nothing(path: Path, tmp_path: 
         assert not marker.exists()
 
 
-def test_the_unpickler_knows_no_names(tmp_path: Path) -> None:
-    with pytest.raises(pickle.UnpicklingError, match=r"mkdir"):
-        plain_values.PlainUnpickler(io.BytesIO(pickle.dumps(Reduce(tmp_path / "called")))).load()
-    assert not (tmp_path / "called").exists()
-
-
 HEAD = b"\x80\x05"
 HOSTILE = {
     "builtins": HEAD + b"c__builtin__\neval\n(V1+1\ntR.",
@@ -423,10 +369,14 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("pickled", HOSTILE.values(), ids=HOSTILE)
-def test_hand_made_pickles_are_refused(path: Path, pickled: bytes) -> None:
+def test_hand_made_pickles_are_refused_and_cost_little_memory(path: Path, pickled: bytes) -> None:
     forge_pickle(path, pickled)
+    tracemalloc.start()
     with pytest.raises(IndexFormatError, match="pickle"):
         read_index(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100e6
 
 
 @pytest.mark.slow
@@ -441,28 +391,9 @@ def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None
     plain_values.require_plain(meta)
 
 
-def test_header_digest_covers_version_and_size() -> None:
-    header = index_file._header(b"{}")
-    assert header[24:56] == blake2b(struct.pack("<II", FORMAT_VERSION, 2) + b"{}", digest_size=32).digest()
-
-
 # --- the disk ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"nowhere.*create the folder"):
         write_index(tmp_path / "nowhere" / "town.index", {}, {})
-
-
-# --- five thousand mutants --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_mutants_are_refused_or_equal_and_cost_little_memory() -> None:
-    """In a process of its own, whose crash or memory would show."""
-    script = Path(__file__).parents[1] / "support" / "fuzz_index.py"
-    done = subprocess.run([sys.executable, script, "--count", "5040"], capture_output=True, text=True, check=True)
-    result = json.loads(done.stdout)
-    assert result["mutants"] == 5040
-    assert result["refused"] > 4800
-    assert result["peak_above_start_mb"] < 150

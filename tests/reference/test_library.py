@@ -1,14 +1,10 @@
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from worlds.fenway import write_streets
 from worlds.networks import grid_network
 
-import roadgeo
 from roadgeo.errors import IndexFormatError, OutputError
-from roadgeo.reference import library
 from roadgeo.reference.files import write_reference
 from roadgeo.reference.library import (
     library_dir,
@@ -116,21 +112,3 @@ def test_where_the_library_lies(
         monkeypatch.setenv(variable, value)
     monkeypatch.setattr(sys, "platform", platform)
     assert library_dir() == Path(expected)
-
-
-def test_the_library_imports_nothing_heavy() -> None:
-    code = "import sys, roadgeo.reference.library; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
-    assert not {"geopandas", "pyogrio", "osmnx", "networkx", "pandas", "scipy.spatial"} & set(loaded)
-    assert library.__name__ in loaded
-
-
-def test_python_opens_a_reference_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the commands did."""
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
-    roadgeo.build_reference(write_streets(tmp_path / "streets.geojson"), path=tmp_path / "boston-ma.gpkg")
-    opened = roadgeo.open_reference("Boston, MA")
-    assert isinstance(opened, roadgeo.Reference)
-    assert opened.name == "boston-ma"
-    with pytest.raises(roadgeo.RoadgeoError, match=r"no reference 'bostn-ma'.*did you mean boston-ma"):
-        roadgeo.open_reference("bostn-ma")

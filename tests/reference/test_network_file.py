@@ -79,11 +79,6 @@ def test_stored_positions_are_fixed_points(xy: list[float], origin: tuple[int, i
     np.testing.assert_array_equal(plane.from_crs(plane.to_crs(once.graph.xy)), once.graph.xy)
 
 
-@given(angle=st.floats(-4, 4, width=32))
-def test_degrees_give_float32_radians_back(angle: float) -> None:
-    assert np.float32(np.radians(np.degrees(float(angle)))) == np.float32(angle)
-
-
 def test_a_crs_without_a_code(tmp_path: Path, network: RoadNetwork) -> None:
     import pyproj
 

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import json
 import os
 import shutil
 import warnings
@@ -29,6 +30,7 @@ from roadgeo.flights.frames import FrameOptions, _video
 from roadgeo.flights.motion import read_motion
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
 from roadgeo.matching.hints import HINTS
+from roadgeo.reference import index_file
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.inspection import _describe_shards
 from roadgeo.reference.network_file import read_network
@@ -82,6 +84,18 @@ def with_checksums(content: bytes) -> bytes:
         made[end : end + 4] = zlib.crc32(made[at + 4 : end]).to_bytes(4, "big")
         at = end + 4
     return bytes(made)
+
+
+def with_digests(content: bytes) -> bytes:
+    """Make the digests of an index's header and pickle agree with what they are of."""
+    size = int.from_bytes(content[20:24], "little")
+    manifest, data = content[64 : 64 + size], content[index_file._aligned(64 + size) :]
+    with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
+        document = json.loads(manifest)
+        document["pickle"]["digest"] = index_file._digest(data[: document["pickle"]["size"]])
+        manifest = json.dumps(document).encode()
+    header = index_file._header(manifest)
+    return header + bytes(-len(header) % 64) + data
 
 
 def read_pixels(path: Path) -> None:
@@ -276,7 +290,7 @@ READERS = {
     "video": Reader(read_frames, "flight.avi"),
     "onnx": Reader(read_model, "model.onnx"),
     "stac": Reader(read_model_beside, "model.json", ("model.onnx",)),
-    "index": Reader(read_index, "a.index"),
+    "index": Reader(read_index, "a.index", packed=with_digests),
     "reference": Reader(read_network, "a.gpkg"),
     "shards": Reader(read_shards, "manifest.json"),
     "crs": Reader(read_crs, "crs.txt"),
