@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import click
 import pytest
@@ -120,11 +119,6 @@ def test_numbers_are_read(kind: Read, text: str, numbers: tuple[float, ...]) -> 
 def test_numbers_that_make_no_sense_are_refused(kind: Read, text: str) -> None:
     with pytest.raises(click.BadParameter, match="expected"):
         kind.convert(text, None, None)
-
-
-def test_python_m_roadgeo_is_roadgeo(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-m", "roadgeo", "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("roadgeo")
 
 
 def test_the_shell_completes_commands(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:

@@ -3,12 +3,12 @@
 import json
 import os
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from worlds.pngs import png
 
 from roadgeo.cli import main
 from roadgeo.evaluation.demo import demo_masks
@@ -16,9 +16,7 @@ from roadgeo.evaluation.demo import demo_masks
 
 def write_hostile(folder: Path) -> int:
     """Write masks that have each ended a run, and return how many."""
-    head = struct.pack(">IIBBBBB", 100_000, 100_000, 1, 0, 0, 0, 0)
-    chunk = struct.pack(">I", 13) + b"IHDR" + head + struct.pack(">I", zlib.crc32(b"IHDR" + head))
-    (folder / "a_header.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + bytes(23))
+    (folder / "a_header.png").write_bytes(png(100_000, 100_000, 1)[:33] + bytes(23))
     (folder / "b_bitmap.bmp").write_bytes(
         b"BM" + bytes(12) + struct.pack("<iiiHH", 40, 20_000, 20_000, 1, 24) + bytes(9)
     )

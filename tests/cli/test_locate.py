@@ -292,69 +292,6 @@ def last_line(capfd: pytest.CaptureFixture[str]) -> str:
     return err.splitlines()[-1]
 
 
-def test_roads_that_are_none_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    import geopandas as gpd
-    import shapely
-
-    line = shapely.LineString([(0, 0), (900, 900)])
-    gpd.GeoDataFrame(geometry=[line], crs=32629).to_file("nocrs.shp")
-    Path("nocrs.prj").unlink()
-    gpd.GeoDataFrame(geometry=[shapely.Point(-71, 42)], crs=4326).to_file("points.geojson")
-    for name, message in [
-        ("nocrs.shp", "has no CRS"),
-        ("points.geojson", "holds Point, expected lines"),
-        ("missing.shp", "no such file"),
-    ]:
-        assert main(["index", "--roads", name, "--out", "x.gpkg"]) == 1
-        assert message in last_line(capfd)
-    assert not Path("x.gpkg").exists()
-
-
-def test_a_place_nobody_can_look_up_is_one_line(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Nothing listens on port 9 of this machine: as good as no network."""
-    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
-    arguments = ["--overpass-url", "http://127.0.0.1:9/api", "--nominatim-url", "http://127.0.0.1:9"]
-    assert main(["index", "--osm", "Atlantis", "--out", "x.gpkg", *arguments]) == 1
-    assert "127.0.0.1" in last_line(capfd)
-    assert not Path("x.gpkg").exists()
-
-
-def test_a_truncated_index_is_refused(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for path in porto.parent.iterdir():
-        shutil.copy(path, ".")
-    content = Path("porto.index").read_bytes()
-    Path("porto.index").write_bytes(content[: len(content) // 2])
-    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
-    assert "truncated" in last_line(capfd)
-    Path("porto.index").unlink()
-    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg", "-q"]) == 0  # rebuilt from the GeoPackage
-
-
-class Malice:
-    def __reduce__(self) -> tuple:
-        return os.system, ("touch it_ran",)
-
-
-def test_a_pickle_that_would_run_code_does_not(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Wherever the index holds its pickle, a hostile one of the same length in its place is refused unread."""
-    import pickle
-
-    for path in porto.parent.iterdir():
-        shutil.copy(path, ".")
-    content = Path("porto.index").read_bytes()
-    start = content.index(b"\x80\x05")
-    evil = pickle.dumps(Malice(), 5)
-    Path("porto.index").write_bytes(content[:start] + evil + content[start + len(evil) :])
-    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
-    assert "porto.index" in last_line(capfd)
-    Path("porto.index").write_bytes(evil)
-    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
-    assert "porto.index" in last_line(capfd)
-    assert not Path("it_ran").exists()
-
-
 @pytest.mark.parametrize("command", ["locate", "index"])
 def test_a_folder_that_cannot_be_written_to_is_named(
     command: str, porto: Path, capfd: pytest.CaptureFixture[str]

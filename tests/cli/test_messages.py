@@ -1,7 +1,6 @@
 """What new users meet first: files that are almost right, and what they are told."""
 
 import json
-import struct
 import zlib
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from worlds.fenway import write_streets
+from worlds.pngs import chunk
 
 from roadgeo.cli import main
 from roadgeo.evaluation.demo import demo_masks
@@ -28,13 +28,6 @@ def locate(mask: str, porto: Path, *more: str) -> int:
 
 def drone() -> np.ndarray:
     return cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE)
-
-
-def png(rows: np.ndarray, *chunks: tuple[bytes, bytes]) -> bytes:
-    """A PNG with further chunks behind its header."""
-    whole = cv2.imencode(".png", rows)[1].tobytes()
-    more = b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
-    return whole[:33] + more + whole[33:]
 
 
 def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -65,7 +58,8 @@ def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: Path) -
 def test_what_libraries_print_is_swallowed(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """libpng and libjpeg print their warnings themselves; of libtiff's errors the reason is told."""
     rows = drone()
-    Path("profile.png").write_bytes(png(rows, (b"iCCP", b"bad\0\0" + zlib.compress(b"no profile"))))
+    whole, profile = cv2.imencode(".png", rows)[1].tobytes(), b"bad\0\0" + zlib.compress(b"no profile")
+    Path("profile.png").write_bytes(whole[:33] + chunk(b"iCCP", profile) + whole[33:])
     assert locate("profile.png", porto, "-q") == 0
     cv2.imwrite("whole.jpg", rows)
     damaged = bytearray(Path("whole.jpg").read_bytes())

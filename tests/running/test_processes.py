@@ -55,48 +55,6 @@ def test_who_stops_early_ends_the_workers_and_no_process_of_the_program() -> Non
         other.join()
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
-    """Ctrl-C goes to the whole group; nobody is left behind, and nobody prints a traceback."""
-    script = tmp_path / "interrupted.py"
-    script.write_text(
-        "import sys, time\n"
-        "from dataclasses import dataclass\n"
-        "from roadgeo.running.processes import run\n"
-        "@dataclass(frozen=True)\n"
-        "class Slow:\n"
-        "    def prepare(self): return self.do\n"
-        "    def do(self, task):\n"
-        "        try:\n"
-        "            time.sleep(0 if task == 'a' else 60)\n"
-        "        finally:\n"
-        "            open(task, 'w').close()\n"
-        "    def give_up(self, task, reason): pass\n"
-        "if __name__ == '__main__':\n"
-        "    try:\n"
-        "        for _ in run(list('abcdef'), Slow(), 2): print('one', flush=True)\n"
-        "    except KeyboardInterrupt:\n"
-        "        sys.exit(130)\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, str(script)],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout.readline() == "one\n"
-    time.sleep(0.3)
-    os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=10)
-    assert process.returncode == 130
-    assert err == ""
-    assert (tmp_path / "b").exists()  # the worker was told, and cleaned up
-    assert not (tmp_path / "f").exists()  # and did not go on with what waited
-    assert is_gone(process.pid)
-
-
 _SLOW = """
 import sys, time
 from dataclasses import dataclass
@@ -115,15 +73,37 @@ if __name__ == '__main__':
 """
 
 
+def start_slow(folder: Path) -> subprocess.Popen[str]:
+    """Start the program in a group of its own."""
+    command, pipe = [sys.executable, "slow.py"], subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
+    """Ctrl-C goes to the whole group; nobody is left behind, and nobody prints a traceback."""
+    (tmp_path / "slow.py").write_text(
+        _SLOW.replace("Slow(), 3", "Slow(), 2").replace("\n    for _", "\n  try:\n    for _")
+        + "  except KeyboardInterrupt:\n    sys.exit(130)\n"
+    )
+    process = start_slow(tmp_path)
+    assert process.stdout.readline() == "one\n"
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert err == ""
+    assert (tmp_path / "b").exists()  # the worker was told, and cleaned up
+    assert not (tmp_path / "f").exists()  # and did not go on with what waited
+    assert is_gone(process.pid)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
 def test_workers_do_not_outlive_whoever_started_them(how: signal.Signals, tmp_path: Path) -> None:
     """Those that work clean up first; those that wait for work end, too."""
     (tmp_path / "slow.py").write_text(_SLOW)
-    command, quiet = [sys.executable, "slow.py"], subprocess.DEVNULL
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=quiet, start_new_session=True
-    ) as process:
+    with start_slow(tmp_path) as process:
         try:
             process.stdout.readline()
             time.sleep(0.3)
@@ -142,14 +122,7 @@ def test_workers_do_not_outlive_whoever_started_them(how: signal.Signals, tmp_pa
 def test_an_interrupt_while_workers_start_is_no_traceback(after_s: float, tmp_path: Path) -> None:
     script = _SLOW.replace("    for _", "    print('starting', flush=True)\n    for _")
     (tmp_path / "slow.py").write_text(script.replace("list('abcdef')", "list('bcdef')"))
-    with subprocess.Popen(
-        [sys.executable, "slow.py"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
+    with start_slow(tmp_path) as process:
         process.stdout.readline()
         time.sleep(after_s)
         os.killpg(process.pid, signal.SIGINT)

@@ -107,15 +107,6 @@ def test_shards_answer_as_the_whole_does(whole, sharded, place):
     assert np.allclose(answers[0].footprint, answers[1].footprint, atol=1.0)
 
 
-def test_a_search_lets_go_of_the_roads_that_masks_before_it_led_to(sharded, monkeypatch):
-    gone = []
-    monkeypatch.setattr(methods, "let_pages_go", gone.extend)
-    assert locate((1200.0, 1300.0), sharded).status == "located"
-    roads = [array for shard in sharded.shards for array in shard.open().road_buckets[:3]]
-    assert {id(array) for array in roads} <= {id(array) for array in gone}
-    assert not any(shard.open().table_entries is array for shard in sharded.shards for array in gone)
-
-
 def test_a_stranger_is_refused_once_for_all_shards(sharded):
     from worlds.scenes import random_network
 

@@ -1,20 +1,19 @@
 """The page in Chromium: pictures are dropped and located, refusals are helped, by mouse, by keys and on a phone."""
 
 import errno
-import http.client
 import json
 import os
 import re
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect, sync_playwright
+from serving.test_server import running
 from support.browser import find_chromium
 
 from roadgeo.evaluation.landscape import Landscape
@@ -77,17 +76,9 @@ def served(town, tmp_path_factory):
         yield server, workers, mask, lonlat
 
 
-@contextmanager
 def serving(workers, references=None, **options):
-    server = Server(workers, references or workers.references, ServeOptions(port=0, workers=2, waiting=4, **options))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        thread.join()
-        server.close()
+    options = ServeOptions(port=0, workers=2, waiting=4, **options)
+    return running(Server(workers, references or workers.references, options))
 
 
 @pytest.fixture(scope="module")
@@ -595,57 +586,26 @@ def test_an_answer_without_its_view_tells_the_place(served, chromium, monkeypatc
     page.close()
 
 
-@contextmanager
-def below_a_path(port):
-    """A proxy that serves the server at `port` below /maps/; its own port."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-            path = self.path.removeprefix("/maps") if self.path.startswith("/maps/") else "/outside"
-            kept = {name: value for name, value in self.headers.items() if name.lower() != "content-length"}
-            connection.request(self.command, path, body or None, kept)
-            answer = connection.getresponse()
-            content = answer.read()
-            connection.close()
-            self.send_response(answer.status)
-            for name, value in answer.getheaders():
-                if name.lower() not in ("transfer-encoding", "connection", "content-length"):
-                    self.send_header(name, value)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
-
-        do_POST = do_DELETE = do_GET  # noqa: N815 (names of the library)
-
-        def log_message(self, *_):
-            pass
-
-    proxy = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    threading.Thread(target=proxy.serve_forever, daemon=True).start()
-    try:
-        yield proxy.server_port
-    finally:
-        proxy.shutdown()
-        proxy.server_close()
-
-
 def test_it_may_lie_below_a_path(served, chromium):
     server, workers, mask, _ = served
     workers.goes_on.set()
-    refused = []
-    with below_a_path(server.server_port) as port:
-        page = chromium.new_page()
-        page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
-        page.goto(f"http://127.0.0.1:{port}/maps/")
-        give(page, mask)
-        wait_for(page, "Located")
-        page.click("#files-of summary")
-        with page.expect_download() as download:
-            page.locator("#files-of a").first.click()
-        assert download.value.suggested_filename == "mask_footprint.tif"
-        page.close()
+    refused, root = [], f"http://127.0.0.1:{server.server_port}"
+
+    def lead(route):
+        """As a proxy does that knows what lies below /maps/ only."""
+        path = route.request.url.removeprefix(root)
+        route.continue_(url=root + (path.removeprefix("/maps") if path.startswith("/maps/") else "/outside"))
+
+    page = chromium.new_page()
+    page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
+    page.route(f"{root}/**", lead)
+    page.goto(f"{root}/maps/")
+    give(page, mask)
+    wait_for(page, "Located")
+    page.click("#files-of summary")
+    named = "(link) => fetch(link.href).then((answer) => answer.headers.get('Content-Disposition'))"
+    assert "mask_footprint.tif" in page.locator("#files-of a").first.evaluate(named)
+    page.close()
     assert refused == []
 
 

@@ -8,14 +8,12 @@ import os
 import re
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -26,6 +24,7 @@ import numpy as np
 import pytest
 from support.groups import is_gone
 from support.mavlink_peer import listening, of_kind
+from worlds.pngs import png
 
 from roadgeo.cli import main
 from roadgeo.errors import IndexFormatError, ModelError
@@ -54,18 +53,6 @@ def place(town, tmp_path_factory):
     query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
     cv2.imwrite(str(folder / "mask.png"), query.mask)
     return folder, query.truth
-
-
-def png(width, height):
-    """A PNG that says it is so large, and holds next to nothing."""
-
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
-    )
 
 
 def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):

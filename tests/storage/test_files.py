@@ -147,11 +147,6 @@ def test_the_old_file_stands_until_the_new_one_is_whole(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new\n"
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"cannot write .*nowhere"):
-        write_text(tmp_path / "nowhere" / "a.json", "")
-
-
 @pytest.mark.skipif(not hasattr(os, "symlink"), reason="no links here")
 def test_planted_links_are_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither at the target, nor where the unfinished file will be, nor in the place of a lock."""

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image
 from worlds.turned import save_turned
 
-from roadgeo.storage.orientation import read_orientation, stored_from_upright, turn_upright
+from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
 ALL = range(1, 9)
 
@@ -16,24 +16,6 @@ ALL = range(1, 9)
 @pytest.fixture
 def upright() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (40, 70, 3)).astype(np.uint8)
-
-
-@pytest.mark.parametrize("kind", ["jpg", "png", "tif", "webp"])
-@pytest.mark.parametrize("orientation", ALL)
-def test_every_orientation_of_every_format_is_read(
-    tmp_path: Path, upright: np.ndarray, kind: str, orientation: int
-) -> None:
-    path = save_turned(tmp_path / f"photo.{kind}", upright, orientation)
-    assert read_orientation(path) == orientation
-    with Image.open(path) as image:
-        assert ImageOps.exif_transpose(image).size == (70, 40)
-
-
-@pytest.mark.parametrize("orientation", ALL)
-def test_what_is_turned_is_upright_again(tmp_path: Path, upright: np.ndarray, orientation: int) -> None:
-    path = save_turned(tmp_path / "photo.png", upright, orientation)
-    np.testing.assert_array_equal(turn_upright(np.asarray(Image.open(path)), orientation), upright)
-    np.testing.assert_array_equal(turn_upright(np.asarray(Image.open(path))[..., 0], orientation), upright[..., 0])
 
 
 @pytest.mark.parametrize("orientation", ALL)

@@ -5,7 +5,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 import rasterio
 import rasterio.control
 from support.loopback import counting_server
+from worlds.pngs import png
 from worlds.turned import mark_turned, save_turned
 
 from roadgeo.errors import MaskError, OutputError
@@ -236,17 +236,6 @@ def test_what_is_no_regular_file(tmp_path, read):
         read(tmp_path / ("n" * 300 + ".png"))
     with pytest.raises(MaskError, match="cannot be read"):
         read(Path("a\0.png"))
-
-
-def png(width: int, height: int, depth: int = 8, colour: int = 0) -> bytes:
-    """Return a PNG of zeros, whole or merely said to be."""
-    rows = zlib.compress(bytes(1 << 16)) if width * height > 1 << 24 else zlib.compress(bytes((width + 1) * height))
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 class TestSizes:
