@@ -14,6 +14,7 @@ from roadgeo.evaluation.demo import demo_masks
 from roadgeo.evaluation.truth import Truth
 
 MASKS = {mask.path.stem: str(mask.path) for mask in demo_masks()}
+LOCATE = ["locate", MASKS["elsewhere"], "--effort", "quick"]
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +26,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def refused(porto: Path) -> roadgeo.Location:
     """The demonstration's mask of another city."""
-    return roadgeo.locate(MASKS["elsewhere"], str(porto))
+    return roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick")
 
 
 def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused):
@@ -46,7 +47,7 @@ def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused)
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd):
-    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", str(n), "--report"]) == 0
+    assert main([*LOCATE, "-r", str(porto), "--take", str(n), "--report"]) == 0
     assert "elsewhere.png: chosen at" in capfd.readouterr().out
     written = {path.name for path in Path().iterdir()}
     assert {"elsewhere_footprint.tif", "elsewhere_location.gpkg", "elsewhere_report.html"} <= written
@@ -63,12 +64,12 @@ def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd
 
 
 def test_a_place_that_is_not_listed_cannot_be_taken(porto, refused, capfd):
-    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", "9"]) == 1
+    assert main([*LOCATE, "-r", str(porto), "--take", "9"]) == 1
     err = capfd.readouterr().err
     assert f"there is no place 9: {len(refused.alternatives)} are listed" in err
     assert len(err.strip().splitlines()) == 1
     assert not list(Path().glob("*_footprint.tif"))
-    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--take", "0"]) == 2
+    assert main([*LOCATE, "-r", str(porto), "--take", "0"]) == 2
 
 
 def test_a_located_mask_stays_located(porto):
@@ -78,23 +79,23 @@ def test_a_located_mask_stays_located(porto):
 
 
 def test_python_takes_a_place_too(porto, refused):
-    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), take=2)
+    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=2)
     assert (taken.status, taken.located, taken.error_rate) == ("chosen", False, None)
     assert taken.to_xarray().shape
     with pytest.raises(NotLocatedError, match="there is no place 9"):
-        roadgeo.locate(MASKS["elsewhere"], str(porto), take=9)
+        roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=9)
     with pytest.raises(ValueError, match="take"):
-        roadgeo.locate(MASKS["elsewhere"], str(porto), take=0)
+        roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=0)
 
 
 def test_a_chosen_place_does_not_count_as_located(porto):
-    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), take=1)
+    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=1)
     truth = Truth("elsewhere.png", "no place", taken.homography, taken.crs, taken.size, on_map=False)
     assert not scoring.score(truth, taken.to_dict()).located
 
 
 def test_the_report_of_a_refusal_names_the_places_and_the_option(porto, refused):
-    assert main(["locate", MASKS["elsewhere"], "-r", str(porto), "--report"]) == 3
+    assert main([*LOCATE, "-r", str(porto), "--report"]) == 3
     page = Path("elsewhere_report.html").read_text()
     assert "--take N" in page
     for place in refused.alternatives:

@@ -311,31 +311,8 @@ def test_limits_can_be_chosen(porto: Reference, drone: RoadMask, found: Location
 # --- its pieces -------------------------------------------------------------------------------------------------------
 
 
-def read_path(svg: str) -> list[np.ndarray]:
-    """Positions of a path of relative lines, the slow way."""
-    lines, at = [], np.zeros(2)
-    for move, rest in re.findall(r"m([-\d ]+)l([-\d ]+)", re.search(r' d="([^"]*)"', svg)[1] if svg else ""):
-        at = at + [int(n) for n in re.findall(r"-?\d+", move)]
-        line = [at]
-        for dx, dy in np.array([int(n) for n in re.findall(r"-?\d+", rest)]).reshape(-1, 2):
-            at = at + np.array([dx, dy])
-            line.append(at)
-        lines.append(np.array(line) / 10)
-    return lines
-
-
 coordinates = st.floats(-1e5, 1e5).map(lambda value: round(value, 1))
 polylines = st.lists(st.integers(2, 6).flatmap(lambda n: arrays(float, (n, 2), elements=coordinates)), max_size=5)
-
-
-@given(polylines)
-def test_a_path_holds_its_lines(lines: list[np.ndarray]) -> None:
-    kept = [line[np.r_[True, (np.diff(line, axis=0) != 0).any(axis=1)]] for line in lines]
-    kept = [line for line in kept if len(line) > 1]
-    read = read_path(draw_lines(lines))
-    assert len(read) == len(kept)
-    for one, other in zip(read, kept, strict=True):
-        assert one == pytest.approx(other, abs=0.051)
 
 
 @given(polylines, st.integers(2, 20), st.sampled_from([0.0, 0.4]))
@@ -345,11 +322,6 @@ def test_thinned_lines_keep_to_the_limit_and_their_ends(lines: list, limit: int,
     ends = [line[[0, -1]].tolist() for line in lines]
     for line in thin:
         assert any(np.allclose(line[[0, -1]], one, atol=0.02) for one in ends)
-
-
-def test_the_longest_lines_are_kept() -> None:
-    lines = [np.array([[0.0, 0.0], [length, 0.0]]) for length in (5.0, 50.0, 10.0, 40.0)]
-    assert [line[1, 0] for line in thin_lines(lines, 5)] == [50.0, 40.0]
 
 
 def test_segments_that_meet_become_one_line() -> None:
@@ -564,3 +536,8 @@ def test_the_list_leads_to_the_reports(browser: Browser, report: Path, porto: Re
             page.click_through(*page.middle(link))
             assert page.run("location.href") == report.as_uri()
             assert page.complaints() == []
+
+
+def test_the_longest_lines_are_kept() -> None:
+    lines = [np.array([[0.0, 0.0], [length, 0.0]]) for length in (5.0, 50.0, 10.0, 40.0)]
+    assert [line[1, 0] for line in thin_lines(lines, 5)] == [50.0, 40.0]

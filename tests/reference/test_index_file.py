@@ -202,12 +202,12 @@ def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     raw = path.read_bytes()
     rng = np.random.default_rng(1)
     n_refused = 0
-    for position in [*range(600), *rng.integers(0, len(raw), 1400).tolist()]:
+    for position in [*range(600), *rng.integers(0, len(raw), 400).tolist()]:
         mutated = bytearray(raw)
         mutated[position] ^= 1 << int(rng.integers(8))
         path.write_bytes(mutated)
         n_refused += refused_or_equal(path)
-    assert n_refused > 1900  # harmless are only paddings
+    assert n_refused > 900  # harmless are only paddings
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_every_truncation_and_extension_is_refused(path: Path) -> None:
 
 @pytest.mark.slow
 @given(data=st.data())
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_moved_ranges_are_refused_or_harmless(path: Path, data: st.DataObject) -> None:
     write_index(path, META, ARRAYS, {"name": "Böston", "n": 150})
     raw = bytearray(path.read_bytes())

@@ -2,7 +2,11 @@
 
 import json
 import shutil
+import time
+from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,8 +16,13 @@ from worlds.fenway import write_vector
 from worlds.scenes import PLANE, random_lines
 
 from roadgeo.cli import main
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.scene import read_query
 
 pytest.importorskip("distributed")
+from roadgeo.running import divided
 from roadgeo.running.divided import owners
 
 PARTS = [f"0/{n}" for n in range(300)]
@@ -119,3 +128,37 @@ def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch,
 def test_it_needs_a_cluster_and_the_usual_search(more, capsys):
     assert main(["locate", __file__, "--divide-map", *more]) == 2
     assert "--divide-map goes with --engine dask" in capsys.readouterr().err
+
+
+class Slow:
+    """Stands for a cluster whose only worker is busy with other masks for a while before each task."""
+
+    def __init__(self):
+        self.limits = []
+
+    def nthreads(self):
+        return {"tcp://one": 1}
+
+    def get_executor(self, **_):
+        return self
+
+    def submit(self, do, made, query, parts, options, against):
+        time.sleep(0.3)
+        self.limits.append(options.search.time_limit_s)
+        future = Future()
+        future.set_result(divided._Answer(Location("q", "not_located", "nothing"), [], parts))
+        return future
+
+
+def test_waiting_for_a_worker_is_no_time_of_the_search():
+    client, options = Slow(), LocateOptions()
+    options = replace(options, search=replace(options.search, time_limit_s=0.5))
+    mask = np.zeros((64, 64), bool)
+    mask[30:34] = mask[:, 30:34] = True
+    query = read_query(RoadMask(mask))
+    traced_s = query.seconds.vectorize
+    found = divided._locate(client, None, {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options)
+    assert found.status == "not_located"
+    assert len(client.limits) == 2
+    assert client.limits[0] > 0.5 - 2.0 * traced_s - 0.1
+    assert client.limits[1] == client.limits[0]

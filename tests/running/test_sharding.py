@@ -368,3 +368,12 @@ def test_what_needs_one_piece_says_so(sharded, asked, capsys):
 def test_what_cannot_be_asked_is_a_usage_error(given, told, capsys):
     assert main(["index", *given]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_search_lets_go_of_the_roads_that_masks_before_it_led_to(sharded, monkeypatch):
+    gone = []
+    monkeypatch.setattr(methods, "let_pages_go", gone.extend)
+    assert locate((1200.0, 1300.0), sharded).status == "located"
+    roads = [array for shard in sharded.shards for array in shard.open().road_buckets[:3]]
+    assert {id(array) for array in roads} <= {id(array) for array in gone}
+    assert not any(shard.open().table_entries is array for shard in sharded.shards for array in gone)

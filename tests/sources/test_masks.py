@@ -523,8 +523,8 @@ def test_voids_are_told_on_request(tmp_path: Path) -> None:
 
 
 @pytest.mark.realdata
-def test_every_real_mask_is_read_and_every_photograph_refused(data_dir: Path) -> None:
-    masks = sorted((data_dir / "massachusetts").glob("**/masks/*.png"))
+def test_real_masks_are_read_and_photographs_refused(data_dir: Path) -> None:
+    masks = sorted((data_dir / "massachusetts").glob("**/masks/*.png"))[::4]
     assert masks
     for path in masks:
         values = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -532,7 +532,7 @@ def test_every_real_mask_is_read_and_every_photograph_refused(data_dir: Path) ->
             mask = read_mask(path)
             assert mask.observed is None
             np.testing.assert_array_equal(mask.roads, values > 127)
-    for path in sorted((data_dir / "massachusetts" / "segmentation" / "images").glob("*.jpg")):
+    for path in sorted((data_dir / "massachusetts" / "segmentation" / "images").glob("*.jpg"))[::4]:
         with pytest.raises(MaskError, match="photograph"):
             read_mask(path)
 

@@ -288,7 +288,7 @@ def test_the_counts_are_those_of_the_documentation():
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", [name for name, counts in REAL.items() if counts[0] < 3000])
 def test_counts_agree_with_an_independent_count(data_dir, name):
     file = data_dir / name
     independent = junctions(osm_ways(file) if ".osm" in name else vector_ways(file))
