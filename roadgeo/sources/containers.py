@@ -7,6 +7,7 @@ The file's name determines its format: OpenStreetMap data through osmium, answer
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,15 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import NoRoadsError, RoadSourceError
-from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, objects
-from roadgeo.sources.osm_files import OSM_ENDINGS, stream_ways
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through, objects
+from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_ways
 from roadgeo.sources.schemas import is_known_column, names_kinds
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.crs_guard import refuse_named_files
 from roadgeo.storage.unpacking import require_bounded
 from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
 
-__all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables"]
+__all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_missing"]
 
 _PARQUET = (".parquet", ".geoparquet", ".pq")
 _GRAPHS = (".graphml",)
@@ -40,6 +41,12 @@ _DRAWINGS = (".gpx", ".kml", ".kmz")
 #: Names of columns that hold shapes in a Parquet file without `geo`.
 _SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
 _PEEK = 1000
+#: What services write into an answer that is a part of what was asked for: ArcGIS, WFS, OGC API - Features.
+_MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d{1,12})")
+_LIMITED = re.compile(
+    rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^>]*\bnext\s*=\s*[\"']\w"
+)
+_ENDS_BYTES = 1 << 16  # of a file, where it says so
 _EXPECTED = (
     "expected a path, a GeoDataFrame, a GeoSeries, a graph of osmnx or momepy, shapely lines, "
     "or arrays of coordinates of shape (N, 2)"
@@ -91,12 +98,14 @@ def _stream_gdal(
     layers = _choose_layers(path, layer, areas=areas)
     for n, held in enumerate(layers):
         total, columns = _choose_columns(path, held)
+        part = what_is_missing(path, total)
         for skip in range(0, max(total, 1), most):
             found = read_layer(path, held, columns, skip, most if total > most else None)
             if found.shapes is None:
                 raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
             shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
             meta = {"format": found.driver, "layer": ", ".join(layers), **found.notes}
+            meta |= {"part": part} if part else {}
             yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(layers))
 
@@ -146,6 +155,26 @@ def _listed(names: Sequence[str]) -> str:
     """Join names for a message, at most eight."""
     shown = ", ".join(names[:8])
     return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+def what_is_missing(path: Path, n_features: int) -> str:
+    """Return what an answer of a service says of features that it left out: "" where it is whole, or says nothing."""
+    ending = path.suffix.lower()
+    if ending not in (".json", ".geojson", ".gml"):
+        return ""
+    with path.open("rb") as file:
+        text = file.read(_ENDS_BYTES)
+        if ending != ".gml":
+            file.seek(max(path.stat().st_size - _ENDS_BYTES, 0))
+            text += file.read()
+    matched = max((int(found[1]) for found in _MATCHED.finditer(text)), default=0)
+    limited = _LIMITED.search(text)
+    if matched > n_features:
+        return f"says that it is not whole: {n_features:,} of {matched:,} features; fetch the rest"
+    if limited and not matched:
+        word = (limited[1] or b"next").decode()
+        return f"says that it is not whole ({word}): {n_features:,} features, and there are more; fetch the rest"
+    return ""
 
 
 # --- Parquet ----------------------------------------------------------------------------------------------------------
@@ -266,28 +295,38 @@ def held_table(roads: Any) -> RoadTable:
 
     if hasattr(roads, "edges") and hasattr(roads, "graph"):  # networkx
         return _graph_table(roads)
-    if hasattr(roads, "columns") and hasattr(roads, "geometry"):
-        columns = {str(name): roads[name].to_numpy(object) for name in roads.columns if name != roads.geometry.name}
-        return RoadTable(roads.geometry.to_numpy(object), crs_name(roads.crs), columns)
+    if hasattr(roads, "columns") and (table := _held_columns(roads)) is not None:
+        return table
     try:
-        listed = [roads] if isinstance(roads, shapely.Geometry) else list(roads)
-        if isinstance(roads, np.ndarray) and roads.ndim == 2:  # one array: cut at its rows that are not finite
-            rows, broken = roads.astype(float), ~np.isfinite(roads.astype(float)).all(axis=1)
-            parts = zip(np.split(rows, np.flatnonzero(broken)), np.split(broken, np.flatnonzero(broken)), strict=True)
-            listed = [part[~gap] for part, gap in parts]
+        is_single = isinstance(roads, shapely.Geometry) or (isinstance(roads, np.ndarray) and roads.ndim == 2)
+        listed = [roads] if is_single else list(roads)
         shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
     except (TypeError, ValueError) as error:
         raise RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {error}; {_EXPECTED}") from error
     return RoadTable(objects(shapes), crs_name(getattr(roads, "crs", None)))
 
 
-def _line(coordinates: Any) -> Any:
+def _held_columns(roads: Any) -> RoadTable | None:
+    """Return a table of geopandas, or of pandas with a column of shapes, as `pd.merge` gives it; None without one."""
     import shapely
 
+    columns = {str(name): roads[name].to_numpy(object) for name in roads.columns}
+    held = [name for name, values in columns.items() if shapely.is_geometry(values).any()]
+    active = getattr(getattr(roads, "geometry", None), "name", None)
+    name = active if active in held or not len(roads) else next(iter(held), None)
+    if name is None:
+        return None
+    shapes = columns.pop(name)
+    return RoadTable(
+        np.where(shapely.is_geometry(shapes), shapes, None), crs_name(getattr(roads, "crs", None)), columns
+    )
+
+
+def _line(coordinates: Any) -> Any:
     points = np.asarray(coordinates, np.float64)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"coordinates of shape {points.shape}")
-    return shapely.LineString(points) if len(points) > 1 else shapely.LineString()
+    return line_through(points)
 
 
 def _graph_table(graph: Any) -> RoadTable:
@@ -344,13 +383,13 @@ def _overpass_elements(path: Path) -> list[Any] | None:
     except (ValueError, RecursionError) as error:
         raise RoadSourceError(f"{path}: not readable as an answer of Overpass: {first_line(error)}") from error
     elements = answer.get("elements") if isinstance(answer, dict) else None
+    if elements is not None and answer.get("remark"):
+        raise RoadSourceError(f"{path}: {GAVE_UP}: {str(answer['remark'])[:200].strip(' .')}; {ASK_LESS}")
     return elements if isinstance(elements, list) else None
 
 
 def overpass_table(elements: Sequence[Any]) -> RoadTable:
-    """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere."""
-    import shapely
-
+    """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere; some may be missing."""
     known = [element for element in elements if isinstance(element, Mapping)]
     nodes = {node["id"]: node for node in known if node.get("type") == "node" and isinstance(node.get("id"), int)}
     shapes: list[Any] = []
@@ -361,10 +400,10 @@ def overpass_table(elements: Sequence[Any]) -> RoadTable:
             continue
         try:
             ends = way.get("geometry") or [nodes.get(node) for node in way.get("nodes") or ()]
-            places = [(float(end["lon"]), float(end["lat"])) for end in ends if end]
+            places = [(float(end["lon"]), float(end["lat"])) if end else (np.nan, np.nan) for end in ends]
         except (LookupError, TypeError, ValueError, OverflowError):
             places = []
-        shapes.append(shapely.LineString(places) if len(places) > 1 else None)
+        shapes.append(line_through(np.reshape(places, (-1, 2))))
         tags.append(own)
     lost = {"without_places": shapes.count(None)} if None in shapes else {}
     meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION}

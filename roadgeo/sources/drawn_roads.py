@@ -5,6 +5,7 @@ They are drawn as a mask would show them, and located like one.
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,14 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._text import visible
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.storage.crs import known_crs
 
 __all__ = ["Drawing", "Units", "draw_roads"]
+
+_LOG = logging.getLogger(__name__)
 
 Units = Literal["auto", "pixels", "metres"]
 
@@ -70,6 +74,8 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
         read = read_lines(Path(path), layer, areas=True)
     except RoadSourceError as error:
         raise MaskError(str(error)) from error
+    if "part" in read.meta:
+        _LOG.warning("%s: %s", visible(name), read.meta["part"])
     import shapely
 
     rings, area = shapely.get_parts(shapely.boundary(read.areas), return_index=True)  # outlines and holes

@@ -11,7 +11,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.georeference import Georeference, fit_place
-from roadgeo.storage.crs import name_crs
+from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 from roadgeo.storage.rasters import open_raster
 
@@ -75,10 +75,7 @@ def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | No
 def _crs_of(raster: DatasetReader) -> str | None:
     """Name the CRS of a raster or of its control points."""
     crs = raster.crs or raster.gcps[1]
-    if not crs:
-        return None
-    code = crs.to_epsg()
-    return f"EPSG:{code}" if code else str(crs.to_wkt())
+    return crs_name(crs.to_wkt()) if crs else None
 
 
 def _crs_beside(path: Path) -> str | None:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray, IntArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 __all__ = [
-    *("OSM_ATTRIBUTION", "RoadLines", "RoadTable", "cut_lines", "join_lines", "objects", "simple_areas"),
-    "simple_lines",
+    *("OSM_ATTRIBUTION", "RoadLines", "RoadTable", "cut_lines", "join_lines", "line_through", "objects"),
+    *("simple_areas", "simple_lines"),
 ]
 
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
@@ -96,6 +96,22 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
 
     lines, areas = (np.concatenate([getattr(part, name) for part in parts]) for name in ("lines", "areas"))
     return RoadLines(lines, first.crs, column("highway"), column("tunnel"), meta, column("name"), areas)
+
+
+def line_through(points: FloatArray) -> Any:
+    """Return the line through (n, 2) or (n, 3) points, in pieces where points between them are not finite.
+
+    None where no two different points follow each other.
+    """
+    import shapely
+
+    known = np.isfinite(points).all(axis=1)
+    cuts = np.flatnonzero(np.diff(known)) + 1
+    pieces = [
+        part for part, is_known in zip(np.split(points, cuts), np.split(known, cuts), strict=True) if all(is_known)
+    ]
+    lines = [shapely.LineString(piece) for piece in pieces if len(np.unique(piece, axis=0)) > 1]
+    return shapely.MultiLineString(lines) if len(lines) > 1 else next(iter(lines), None)
 
 
 def simple_lines(shapes: AnyArray) -> tuple[AnyArray, AnyArray]:

@@ -16,12 +16,12 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through
 from roadgeo.storage.pbf import read_parts
 from roadgeo.storage.unpacking import read_chunks
 from roadgeo.storage.vectors import first_line
 
-__all__ = ["OSM_ENDINGS", "stream_ways"]
+__all__ = ["ASK_LESS", "GAVE_UP", "OSM_ENDINGS", "stream_ways"]
 
 OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2", ".o5m"),)
 
@@ -29,6 +29,9 @@ OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", 
 _NODES_IN_MEMORY = 100_000_000
 #: An object that JOSM's user has deleted stays in its file.
 _DELETED = re.compile(rb"<way\b(?=[^>]*\baction=[\"']delete)[^>]*\bid=[\"'](-?\d{1,18})[\"']")
+#: Overpass ends an answer so that it could not complete.
+_REMARK = re.compile(rb"<remark>\s*([^<]{1,200}?)\s*</remark>")
+GAVE_UP, ASK_LESS = "says that it is not whole", "ask for a smaller area, or again"
 _MOST_TAG = 4096
 
 _Way = tuple[Any, str, str | None, str | None]  # line, highway, tunnel, name
@@ -38,7 +41,7 @@ def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder:
     """Yield the ways with a `highway` tag that exist, in their newest versions, in parts of bounded size.
 
     Nodes may stand behind ways or be left out where ways bring their places along. A way cut off by an extract is
-    the part whose nodes are there; ways without any are counted.
+    the parts whose nodes are there; ways without any are counted.
 
     Parameters
     ----------
@@ -123,7 +126,7 @@ def _highways(path: Path, header: Any, advance: Callable[[float], None], folder:
 
 
 def _way_shape(way: Any, factory: Any, census: _Census | None) -> Any:
-    """Return a way as WKB, of the nodes whose places are known; None where these are fewer than two different ones."""
+    """Return a way as WKB, in pieces between the nodes whose places are not known; None where nothing is left."""
     import osmium
     import shapely
 
@@ -135,8 +138,7 @@ def _way_shape(way: Any, factory: Any, census: _Census | None) -> Any:
     found = census.places([node.ref for node in nodes]) if census else np.full((len(nodes), 2), np.nan)
     for k in np.flatnonzero(own):
         found[k] = nodes[k].location.lon, nodes[k].location.lat
-    known = found[np.isfinite(found).all(axis=1)]
-    return shapely.to_wkb(shapely.LineString(known)) if len(np.unique(known, axis=0)) > 1 else None
+    return shapely.to_wkb(line_through(found))
 
 
 @dataclass(frozen=True)
@@ -196,12 +198,20 @@ def _newest(objects: array[int]) -> tuple[IntArray, set[tuple[int, int]]]:
 
 
 def _deleted_ways(path: Path) -> set[int]:
-    """Return the ids of the ways that JOSM's user has deleted: they stay in its files. And bound what is unpacked."""
+    """Return the ids of the ways that JOSM's user has deleted: they stay in its files. And bound what is unpacked.
+
+    Raises
+    ------
+    RoadSourceError
+        It is an answer that Overpass did not complete.
+    """
     found, tail = set(), b""
     for chunk in read_chunks(path):
         text = tail + chunk
         if b"delete" in text:
             found |= {int(number) for number in _DELETED.findall(text)}
+        if remark := _REMARK.search(text):
+            raise RoadSourceError(f"{path}: {GAVE_UP}: {remark[1].decode('utf-8', 'replace').rstrip('.')}; {ASK_LESS}")
         tail = text[-_MOST_TAG:]
     return found
 

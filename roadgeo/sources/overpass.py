@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -24,10 +25,10 @@ from urllib.parse import urlsplit
 
 from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
-from roadgeo._text import counted
+from roadgeo._text import counted, visible
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways
-from roadgeo.sources.containers import overpass_table
+from roadgeo.sources.containers import overpass_table, what_is_missing
 from roadgeo.sources.lines import RoadLines, simple_areas
 from roadgeo.sources.schemas import recognise
 from roadgeo.storage.crs import crs_name
@@ -35,6 +36,8 @@ from roadgeo.storage.folders import cache_dir, writable
 from roadgeo.storage.vectors import first_line, read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
+
+_LOG = logging.getLogger(__name__)
 
 _BUSY = (429, 504)  # osmnx waits a minute, and asks again without end
 _MOST_TRIES = 5
@@ -167,6 +170,8 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
         raise RoadSourceError(f"{path}: holds no shapes that can be read: {first_line(error)}") from error
     if len(parts) == 0:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
+    if part := what_is_missing(path, len(found.shapes)):
+        _LOG.warning("%s: %s", visible(str(path)), part)
     crs = crs_name(found.crs)
     if crs is None:
         raise RoadSourceError(f"{path}: has no CRS; save the outline with one, for example as GeoJSON")

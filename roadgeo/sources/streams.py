@@ -189,6 +189,8 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             _LOG.warning(
                 "%s: left out %s of %s features, which %s", name, f"{meta[key]:,}", f"{meta['features']:,}", what
             )
+    if "part" in meta:
+        _LOG.warning("%s: %s", name, meta["part"])
     if "encoding" in meta:
         _LOG.warning("%s: its text is not in the encoding that it names; read as Latin-1, names may be garbled", name)
     if meta.get("without_kind"):

@@ -246,7 +246,7 @@ def _describe_crs(crs: str) -> tuple[str, int | None, str]:
 
     try:
         parsed = known_crs(crs)
-        return parsed.name, parsed.to_epsg(), parsed.to_wkt("WKT1_GDAL")
+        return parsed.name, parsed.to_epsg(min_confidence=100), parsed.to_wkt("WKT1_GDAL")
     except pyproj.exceptions.CRSError as error:
         raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error
 

@@ -5,11 +5,12 @@ import logging
 import geopandas as gpd
 import networkx as nx
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from worlds.fenway import streets
 
-from roadgeo.errors import RoadSourceError
+from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.sources.roads import choose_roads
 
 CRS = "EPSG:4326"
@@ -104,3 +105,26 @@ def test_a_value_that_is_stored_once_counts_as_often_as_it_is_read(which, nested
     assert (tmp_path / "roads.parquet").stat().st_size < 5000
     with pytest.raises(RoadSourceError, match="unpacks to more than 100 times its size"):
         choose_roads(tmp_path / "roads.parquet")
+
+
+def merged(name: str = "geometry") -> pd.DataFrame:
+    """Return what `pd.merge` of a table and a GeoDataFrame gives: it has shapes, and no CRS."""
+    roads = gpd.GeoDataFrame({"highway": streets()[1], name: streets()[0]}, geometry=name, crs=CRS)
+    ranks = pd.DataFrame({"highway": sorted(set(streets()[1])), "rank": 1})
+    return pd.merge(ranks, roads, on="highway")
+
+
+@pytest.mark.parametrize("name", ["geometry", "geom"])
+def test_a_table_with_shapes_needs_a_crs(name: str) -> None:
+    table = merged(name)
+    with pytest.raises(CrsError, match="the roads: has no CRS; name it"):
+        choose_roads(table)
+    right = choose_roads(gpd.GeoDataFrame({"highway": streets()[1]}, geometry=streets()[0], crs=CRS))
+    assert len(choose_roads(table, crs=4326)) == len(right)
+    table.loc[0, name] = None
+    assert len(choose_roads(table, crs=4326)) == len(right) - 1
+
+
+def test_a_table_without_shapes_is_refused() -> None:
+    with pytest.raises(RoadSourceError, match="roads of type DataFrame cannot be read"):
+        choose_roads(pd.DataFrame({"highway": streets()[1], "geometry": shapely.to_wkt(streets()[0])}), crs=4326)

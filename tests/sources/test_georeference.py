@@ -112,3 +112,37 @@ def test_a_place_without_an_area_is_refused(tmp_path: Path) -> None:
     flat = rasterio.Affine(0.5, 0.0, 330_000.0, 0.5, 0.0, 4_690_000.0)
     with pytest.raises(MaskError, match="to a line"):
         read_georeference(write(tmp_path / "a.tif", crs="EPSG:32619", transform=flat))
+
+
+SHIFTED = {
+    "utm": "+proj=utm +zone=29 +ellps=intl +towgs84=-87,-98,-121 +units=m",
+    "utm, far": "+proj=utm +zone=29 +ellps=intl +towgs84=-231,-196.1,482.2 +units=m",
+    "degrees": "+proj=longlat +ellps=bessel +towgs84=582,105,414,1.04,0.35,-3.08,8.3",
+    "gauss-krueger": "+proj=tmerc +lon_0=9 +x_0=3500000 +ellps=bessel +towgs84=598.1,73.7,418.2,.202,.045,-2.455,6.7",
+    "of no name": "+proj=utm +zone=29 +ellps=intl +units=m",
+}
+
+
+@pytest.mark.parametrize("where", ["geotransform", "control points", "prj"])
+@pytest.mark.parametrize("name", SHIFTED)
+def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: str) -> None:
+    crs = pyproj.CRS(SHIFTED[name])
+    west, north = pyproj.Transformer.from_crs(4326, crs, always_xy=True).transform(-8.6, 41.15)
+    step = 1e-5 if name == "degrees" else 1.0
+    place = rasterio.Affine(step, 0, west, 0, -step, north)
+    if where == "geotransform":
+        path = write(tmp_path / "a.tif", crs=crs.to_wkt(), transform=place)
+    elif where == "control points":
+        spots = [(0, 0), (80, 0), (80, 60), (0, 60)]
+        points = [GroundControlPoint(row, column, *at(place, column, row)) for column, row in spots]
+        path = write(tmp_path / "a.tif", gcps=points, crs=crs.to_wkt())
+    else:
+        path = tmp_path / "a.png"
+        cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+        path.with_suffix(".wld").write_text(f"{step}\n0\n0\n{-step}\n{west + step / 2}\n{north - step / 2}\n")
+        path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
+    found = read_georeference(path)
+    assert found is not None
+    middle = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform(*at(place, 40, 30))
+    assert found.middle() == pytest.approx(middle, abs=1e-7)
+    assert "EPSG:2" not in found.crs[:6]

@@ -107,3 +107,11 @@ def test_misuse_is_named(tmp_path: Path) -> None:
     write_layers(path, [Layer("a", columns={"n": [1]})])
     with pytest.raises(IndexFormatError, match="no layer 'b'"):
         read_layer(path, "b")
+
+
+def test_a_crs_that_resembles_one_of_epsgs_keeps_its_own_datum(tmp_path: Path) -> None:
+    path, crs = tmp_path / "a.gpkg", "+proj=utm +zone=29 +ellps=intl +towgs84=-231,-196.1,482.2 +units=m"
+    write_layers(path, [Layer("a", "POINT", np.zeros((1, 2)), {}, crs)])
+    with closing(sqlite3.connect(path)) as database:
+        (number,) = database.execute("SELECT srs_id FROM gpkg_contents").fetchone()
+    assert number >= 100_000
