@@ -164,13 +164,14 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
         return polygon, "the given area"
     path = Path(polygon)
     found = read_layer(path, None, ())
+    shapes = [] if found.shapes is None else found.shapes
     try:
-        parts = simple_areas(shapely.from_wkb(found.shapes if found.shapes is not None else []))
+        parts = simple_areas(shapely.from_wkb(shapes))
     except shapely.errors.ShapelyError as error:
         raise RoadSourceError(f"{path}: holds no shapes that can be read: {first_line(error)}") from error
     if len(parts) == 0:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
-    if part := what_is_missing(path, len(found.shapes)):
+    if part := what_is_missing(path, len(shapes)):
         _LOG.warning("%s: %s", visible(str(path)), part)
     crs = crs_name(found.crs)
     if crs is None:
