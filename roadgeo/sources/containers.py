@@ -316,10 +316,8 @@ def _held_columns(roads: Any) -> RoadTable | None:
     name = active if active in held or not len(roads) else next(iter(held), None)
     if name is None:
         return None
-    shapes = columns.pop(name)
-    return RoadTable(
-        np.where(shapely.is_geometry(shapes), shapes, None), crs_name(getattr(roads, "crs", None)), columns
-    )
+    shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
+    return RoadTable(shapes, crs_name(getattr(roads, "crs", None)), columns)
 
 
 def _line(coordinates: Any) -> Any:

@@ -29,7 +29,7 @@ from roadgeo._text import counted, visible
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways
 from roadgeo.sources.containers import overpass_table, what_is_missing
-from roadgeo.sources.lines import RoadLines, simple_areas
+from roadgeo.sources.lines import RoadLines, objects, simple_areas
 from roadgeo.sources.schemas import recognise
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.folders import cache_dir, writable
@@ -164,7 +164,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
         return polygon, "the given area"
     path = Path(polygon)
     found = read_layer(path, None, ())
-    shapes = [] if found.shapes is None else found.shapes
+    shapes = objects([] if found.shapes is None else found.shapes)
     try:
         parts = simple_areas(shapely.from_wkb(shapes))
     except shapely.errors.ShapelyError as error:
