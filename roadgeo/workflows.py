@@ -70,6 +70,7 @@ def build_reference(
     from roadgeo.sources.roads import choose_roads
 
     chosen = choose_roads(roads, kinds, tunnels, attribution, say)
+    warm_up(say, map_only=True)
     options = options or BuildOptions()
     meta = {"name": name, **chosen.meta}
     network = build_network(chosen.lines, chosen.plane, meta, options, say, names=chosen.names, kinds=chosen.kinds)

@@ -5,10 +5,13 @@ from __future__ import annotations
 __all__ = ["compile_once"]
 
 
-def compile_once(quiet: bool) -> None:
-    """Make the kernels ready; where they were not compiled yet, show that on standard error."""
+def compile_once(quiet: bool, map_only: bool = False) -> None:
+    """Make the kernels ready; where they were not compiled yet, show that on standard error.
+
+    A map alone needs half of them.
+    """
     from roadgeo.cli.progress import show_steps
     from roadgeo.kernels.warmup import warm_up
 
     with show_steps(quiet) as say:
-        warm_up(say)
+        warm_up(say, map_only)

@@ -126,7 +126,7 @@ def index_command(
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     with show_steps(quiet) as say:
         roads = read(source, given, say)
-    compile_once(quiet)  # nobody waits for that whose roads cannot be read
+    compile_once(quiet, map_only=True)  # nobody waits for that whose roads cannot be read
     with show_steps(quiet) as say:
         reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
     if verbose:
@@ -189,7 +189,7 @@ def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.reference.reference import rebuild_reference
 
     path = resolve_whole(name)
-    compile_once(quiet)
+    compile_once(quiet, map_only=True)
     with show_steps(quiet) as say:
         reference = rebuild_reference(path, say)
     if not quiet:

@@ -100,7 +100,7 @@ def build_in_shards(
         source["bbox"],
         source["attribution"],
     )
-    compile_once(quiet)
+    compile_once(quiet, map_only=True)
     with show_steps(quiet) as say:
         options = ShardOptions(**shards, margin_m=margin)
         reference = build_shards(files, path, make_slug(name), options, jobs=jobs, cluster=cluster, say=say)

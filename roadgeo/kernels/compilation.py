@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import gc
 import hashlib
 import importlib
 import importlib.util
@@ -21,12 +22,14 @@ import os
 import platform
 import re
 import struct
+import subprocess  # nosec B404
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TextIO, TypeVar, cast
 
 import numpy as np
 
@@ -34,7 +37,16 @@ from roadgeo import __version__
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of, leaves
 from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, writable
 
-__all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
+__all__ = [
+    "Kernel",
+    "compiled",
+    "entries",
+    "kernel",
+    "kernel_folder",
+    "load",
+    "modules_of_maps",
+    "modules_of_the_search",
+]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 #: Called with the number of kernels that are compiled, and of all.
@@ -228,6 +240,8 @@ _MATCHING = (
     "road_votes",
     "road_growth",
 )
+#: What a map needs: the first thing that a newcomer makes.
+_MAPS = ("simplification", "parallel_roads", "intersections", "buckets", "triple_codes", "roads")
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []
 
@@ -235,6 +249,11 @@ _kept_alive: list[Any] = []
 def modules_of_the_search() -> list[str]:
     """Names of the modules whose kernels every search needs."""
     return [f"roadgeo.kernels.{name}" for name in (*_DRAWING, *_MATCHING)]
+
+
+def modules_of_maps() -> list[str]:
+    """Names of the modules whose kernels a map needs, of those of the search."""
+    return [f"roadgeo.kernels.{name}" for name in _MAPS]
 
 
 def entries(module: str) -> list[Kernel]:
@@ -307,10 +326,94 @@ def load(modules: Sequence[str] | None = None, progress: Progress | None = None)
     with _lock:
         wanted = [m for m in modules or modules_of_the_search() if m not in _left_to_numba]
         missing = [m for m in wanted if not _load(m)]
-        total, done = sum(len(entries(m)) for m in missing), 0
-        for module in missing:
-            _compile(module, lambda n, done=done: progress(done + n, total) if progress else None)  # type: ignore[misc]
-            done += len(entries(module))
+        if missing:
+            with _without_collection():
+                _compile_together(missing, progress or (lambda _done, _total: None))
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """Keep all objects meanwhile: to search for cycles among those of a compiler takes a tenth of its time."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _compile_together(modules: Sequence[str], progress: Progress) -> None:
+    """Compile modules in as many processes as there are processors.
+
+    This process begins with the first module, the others with the last: neighbours have parts in common, and each
+    process compiles a part once.
+    """
+    kernels = {module: len(entries(module)) for module in modules}
+    waiting, done = deque(modules), dict.fromkeys(modules, 0)
+
+    def report(module: str, n: int) -> None:
+        done[module] = n
+        progress(sum(done.values()), sum(kernels.values()))
+
+    def take(pop: Callable[[], str]) -> Iterator[str]:
+        with contextlib.suppress(IndexError):
+            while True:
+                yield pop()
+
+    def share(helper: subprocess.Popen[str]) -> None:
+        with contextlib.suppress(OSError), helper:  # one that dies leaves its module to this process
+            for module in take(waiting.pop):
+                if _ask(helper, module):
+                    done[module] = kernels[module]
+
+    threads = [threading.Thread(target=share, args=(helper,), daemon=True) for helper in _helpers(len(modules) - 1)]
+    for thread in threads:
+        thread.start()
+    for module in take(waiting.popleft):
+        _compile(module, functools.partial(report, module))
+    for thread in threads:
+        while thread.is_alive():
+            thread.join(0.2)
+            progress(sum(done.values()), sum(kernels.values()))
+    for module in modules:
+        if module not in _left_to_numba and not _load(module):
+            _compile(module, functools.partial(report, module))
+
+
+#: Starts a process that compiles the modules whose names it reads, line by line, and answers when each is done.
+_HELP = """
+import sys
+sys.path[:] = sys.argv[1:]
+from roadgeo.kernels.compilation import load
+for line in sys.stdin:
+    load([line.strip()])
+    print("done", flush=True)
+"""
+#: More would wait for the longest module.
+_MOST_HELPERS = 6
+
+
+def _helpers(most: int) -> Iterator[subprocess.Popen[str]]:
+    """Start a process that compiles for each other processor. It ends when nobody asks it any more."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
+    # Within another program, as QGIS, that is what `sys.executable` may name.
+    if not Path(sys.executable or "").stem.lower().startswith("python"):
+        return
+    command = [sys.executable, "-I", "-c", _HELP, *sys.path]
+    for _ in range(min(most, processors - 1, _MOST_HELPERS)):
+        with contextlib.suppress(OSError):
+            yield subprocess.Popen(  # noqa: S603 # nosec B603
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+
+
+def _ask(helper: subprocess.Popen[str], module: str) -> bool:
+    """Let another process compile a module; return whether it did."""
+    write, read = cast("tuple[TextIO, TextIO]", (helper.stdin, helper.stdout))
+    print(module, file=write, flush=True)
+    return bool(read.readline())
 
 
 def _file(module: str) -> Path:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.kernels.compilation import kernel_folder, load
+from roadgeo.kernels.compilation import kernel_folder, load, modules_of_maps
 
 __all__ = ["remove_unused", "warm_up"]
 
@@ -18,8 +18,8 @@ __all__ = ["remove_unused", "warm_up"]
 _KEPT_DAYS = 30.0
 
 
-def warm_up(say: Say = say_nothing) -> None:
-    """Load the machine code of the search; compile it first where this machine lacks it.
+def warm_up(say: Say = say_nothing, map_only: bool = False) -> None:
+    """Load the machine code of the search, or of a map only; compile it first where this machine lacks it.
 
     It is cheap to call again. `say` is called for compilation only.
     """
@@ -28,9 +28,9 @@ def warm_up(say: Say = say_nothing) -> None:
     def tell(done: int, total: int) -> None:
         nonlocal compiling
         compiling = True
-        say(f"Compiling {total} kernels for this machine: takes about 40 s, once", done / total)
+        say(f"Compiling {total} kernels for this machine, once: up to half a minute", done / total)
 
-    load(progress=tell)
+    load(modules_of_maps() if map_only else None, tell)
     _note_use()
     if compiling:
         remove_unused(kernel_folder())
