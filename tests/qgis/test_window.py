@@ -36,8 +36,8 @@ def seen(qgis: Qgis, folder: Path) -> dict:
         if os.environ.get("ROADGEO_REQUIRE_QGIS"):
             pytest.fail("ROADGEO_REQUIRE_QGIS is set, and xvfb-run or qgis is not installed")
         pytest.skip("QGIS's window needs qgis and xvfb-run (Debian: qgis xvfb xauth)")
-    picture = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
-    task = {"roads": str(ROADS), "picture": str(picture), "pictures": str(folder)}
+    masks = {mask.path.stem: str(mask.path) for mask in demo_masks()}
+    task = {"roads": str(ROADS), "picture": masks["drone"], "refused": masks["elsewhere"], "pictures": str(folder)}
     answer = qgis.tour(**task, mended=str(qgis.folder / "mended"))
     assert "error" not in answer, answer["error"]
     return {**answer, "mended": str(qgis.folder / "mended")}
@@ -107,7 +107,7 @@ def test_the_window_shows_footprint_and_roads(seen: dict, folder: Path) -> None:
     window = cv2.imread(str(folder / "window.png"))
     assert count_color(window, FOOTPRINT) > 500
     assert count_color(window, ROAD) > 1000
-    for name in ("setup", "build", "locate", "locate_log", "places", "place", "menu"):
+    for name in ("setup", "build", "locate", "locate_log", "places", "place", "menu", "taken"):
         assert cv2.imread(str(folder / f"{name}.png")).std() > 15  # not an empty box
 
 
@@ -129,6 +129,15 @@ def test_what_is_not_sure_at_the_chosen_place_either_is_mended_from_there(seen: 
     assert np.allclose(footprint, expected, atol=0.01)
     assert seen["refused"] == "drone: no"
     assert seen["refused_buttons"] == []
+
+
+def test_a_place_of_a_refused_picture_is_taken_and_the_result_says_so(seen: dict) -> None:
+    taken = seen["taken"]
+    assert taken["STATUS"] == "chosen"
+    assert taken["REASON"].startswith(f"chosen by you: place 2 of {taken['listed']}; ")
+    assert [float(taken["LONGITUDE"]), float(taken["LATITUDE"])] == pytest.approx(taken["place"], abs=1e-4)
+    assert Path(taken["FOOTPRINT"]).exists()
+    assert taken["message"].startswith("elsewhere: chosen by you: place 2 of ")
 
 
 def test_the_panel_opens_with_the_points_of_what_was_located(seen: dict) -> None:

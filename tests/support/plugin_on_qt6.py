@@ -114,7 +114,7 @@ def main():
     dock._renew([match(u, v, 2.0 * u, 3.0 * v) for u, v in ((0, 0), (100, 0), (100, 80), (0, 80), (40, 30))])
     dock.delete_chosen()
     dock.undo()
-    place = loaded["library"].Place(8.0, 47.0, 3.0, "town")
+    place = loaded["library"].Place(8.0, 47.0, 3.0, "town", [])
     loaded["places"].list_places = lambda _: [place]
     loaded["places"]._measure = lambda *_: 0.0
     location = {"reason": "two places fit", "footprint_lonlat": None}

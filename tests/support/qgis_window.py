@@ -186,7 +186,7 @@ def choose(messages, window):
     iface.mapCanvas().waitWhileRendering()
     extent = iface.mapCanvas().extent()
     ANSWER["looked_at"] = extent.center().x()
-    keep(dialog, "places")
+    keep(dialog, "alike")
     ANSWER["places"] = [[dialog.list.topLevelItem(row).text(k) for k in (1, 2, 3)] for row in range(len(dialog.places))]
     dialog.button.click()
     again = window.OPEN[-1]
@@ -206,6 +206,35 @@ def choose(messages, window):
     messages.announce("locatemask", replace(found, location=refused))
     ANSWER["refused"], buttons = message()
     ANSWER["refused_buttons"] = list(buttons)
+    take(window)
+
+
+def take(window):
+    """A picture of another city is refused; the second of its places is looked at, and taken."""
+    wanted = {"MASK": TASK["refused"], "REFERENCE": "porto-streets", "OUTPUT_FOLDER": "TEMPORARY_OUTPUT"}
+    fill_and_run(window.open_dialog("locatemask", wanted), "refused")
+    _, buttons = message()
+    buttons["Choose the place..."].click()
+    dialog = window.OPEN[-1]
+    dialog.list.setCurrentItem(dialog.list.topLevelItem(1))
+    settle()
+    iface.mapCanvas().waitWhileRendering()
+    keep(dialog, "places")
+    second = dialog.places[1]
+    dialog.take()
+    running, loop, ended = window.OPEN[-1], QEventLoop(), []
+    running.algorithmFinished.connect(lambda *done: (ended.extend(done), loop.quit()))
+    QTimer.singleShot(240_000, loop.quit)
+    loop.exec()
+    results = {key: str(value) for key, value in ended[1].items()}
+    ANSWER["taken"] = {"place": [second.lon, second.lat], "listed": len(dialog.places), **results}
+    keep(running, "taken_log")
+    running.close()
+    ANSWER["taken"]["message"], buttons = message()
+    buttons["Zoom to it"].click()
+    settle()
+    iface.mapCanvas().waitWhileRendering()
+    keep(iface.mainWindow(), "taken")
 
 
 def residuals(dock):

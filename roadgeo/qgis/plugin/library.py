@@ -51,12 +51,15 @@ class Place:
         Decimal logarithm of how many times less likely it is than the best, at least; 0 for the best.
     map : str
         Name of the reference that holds it, "" if unknown.
+    footprint : list of [float, float]
+        Corners, longitude and latitude; empty where only the middle is known.
     """
 
     lon: float
     lat: float
     less: float
     map: str
+    footprint: list[list[float]]
 
 
 _SHELVED: list[Reference] = []
@@ -88,7 +91,7 @@ def find_reference(value: str) -> Reference:
 def list_places(location: dict[str, Any]) -> list[Place]:
     """List the places at which a picture may lie, the best first, with the maps that hold them."""
     lead = location["log10_odds"] or 0.0
-    best = [{"center": location["center"], "log10_odds": 0.0}] if location["center"] else []
+    best = [{**location, "log10_odds": 0.0}] if location["center"] else []
     maps = sorted(list_references(), key=lambda known: known.name != location["reference"])
     boxes = [(known.name, _box(known.file)) for known in maps if known.file]
     places: list[Place] = []
@@ -97,7 +100,8 @@ def list_places(location: dict[str, Any]) -> list[Place]:
         on = (name for name, box in boxes if box.contains(QgsPointXY(lon, lat)))
         # On its own map a place has odds against the best; where it is itself the best there, the lead is the least.
         less = -odds if odds < 0.0 else max(lead, 0.0)
-        places.append(Place(lon, lat, less if places else 0.0, next(on, "")))
+        footprint = found.get("footprint_lonlat") or []
+        places.append(Place(lon, lat, less if places else 0.0, next(on, ""), footprint))
     return places
 
 

@@ -33,14 +33,16 @@ def announce_ready(version: str) -> None:
 def announce(algorithm: str, finding: Finding) -> None:
     """Report a result in the window's message bar, with buttons for the next step."""
     location, offered = finding.location, {}
-    located = location["status"] in ("located", "chosen")
-    if located:
+    located, chosen = (location["status"] == status for status in ("located", "chosen"))
+    if chosen:
+        text = location["reason"]
+    elif located:
         up_deg = location["rotation_deg"] % 360.0
-        text = f"{location['status']}, {location['gsd_m']:.2g} m per pixel, up is {up_deg:.0f}° from north"
+        text = f"located, {location['gsd_m']:.2g} m per pixel, up is {up_deg:.0f}° from north"
     else:
-        chosen = finding.parameters.get("NEAR")
-        text = f"{'not sure near the chosen place either: ' if chosen else ''}{location['reason']}"
-    if not located and location["alternatives"]:
+        near = finding.parameters.get("NEAR")
+        text = f"{'not sure near the chosen place either: ' if near else ''}{location['reason']}"
+    if not (located or chosen) and location["alternatives"]:
         offered["Choose the place..."] = lambda: keep(PlacesDialog(algorithm, finding))
     elif location["footprint_lonlat"]:  # of a refused picture, a place that is known along one direction only
         offered["Zoom to it"] = lambda: zoom(location["footprint_lonlat"])
@@ -49,6 +51,8 @@ def announce(algorithm: str, finding: Finding) -> None:
     if finding.page:
         offered["Report"] = lambda: QDesktopServices.openUrl(QUrl.fromLocalFile(finding.page))
     level, lasts_s = (Qgis.MessageLevel.Success, 20) if located else (Qgis.MessageLevel.Warning, 0)
+    if chosen:
+        level = Qgis.MessageLevel.Info
     QTimer.singleShot(_AFTER_MS, lambda: push(finding.name, text, offered, level, lasts_s))
 
 

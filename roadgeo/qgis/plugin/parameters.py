@@ -283,7 +283,12 @@ _HINTS = _fold(
 _REPORT = _option(
     "locate", "--report", "Open a report", "A page with map, mask, residuals and numbers, in the browser."
 )
-SEARCH = (_REFERENCE, _AREA, _REPORT, *_READING, *_HINTS)
+_TAKE = _option(
+    "locate", "--take", "Take the place of this number",
+    "Where nothing is located: draw the picture at the place of that number of those that the refusal lists, as chosen "
+    "by you.",
+)  # fmt: skip
+SEARCH = (_REFERENCE, _AREA, _REPORT, *_READING, *_HINTS, *_fold(_TAKE))
 OUTPUT_FOLDER = Option(
     QgsProcessingParameterFolderDestination, "OUTPUT_FOLDER", "Folder for the results", "Made if it is missing."
 )

@@ -1,4 +1,4 @@
-"""The places at which a picture may lie: looked at on the map, until it is searched for again near the chosen one."""
+"""The places at which a picture may lie: looked at on the map, until one is taken, or searched for again."""
 
 from __future__ import annotations
 
@@ -52,12 +52,15 @@ class PlacesDialog(QDialog):
         self.list.currentItemChanged.connect(self._look)
         self.list.doubleClicked.connect(self.choose)
         advice = QLabel(
-            f"{finding.location['reason']}\nSelect a place to see it on the map; have the picture located where you "
-            "know it is. Where that does not decide, mend it by hand."
+            f"{finding.location['reason']}\nSelect a place to see it on the map. Where you know it to be right, "
+            "take it: the picture is drawn there, as chosen by you. Or have the picture located near the place, with "
+            "less of the map to search."
         )
         advice.setWordWrap(True)
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
-        self.button = buttons.addButton("Locate it here...", QDialogButtonBox.ButtonRole.AcceptRole)
+        self.taking = buttons.addButton("Take it", QDialogButtonBox.ButtonRole.AcceptRole)
+        self.taking.clicked.connect(self.take)
+        self.button = buttons.addButton("Locate it here...", QDialogButtonBox.ButtonRole.ActionRole)
         self.button.clicked.connect(self.choose)
         buttons.rejected.connect(self.reject)
         column = QVBoxLayout(self)
@@ -67,21 +70,27 @@ class PlacesDialog(QDialog):
         self.finished.connect(self._clear)
         self.list.setCurrentItem(self.list.topLevelItem(0))
 
-    def _chosen(self) -> Place:
-        return self.places[int(self.list.indexOfTopLevelItem(self.list.currentItem()))]
+    def _number(self) -> int:
+        """Return the number of the selected place, from 0."""
+        return int(self.list.indexOfTopLevelItem(self.list.currentItem()))
 
     def _look(self) -> None:
         """Show the selected place, as much around it as the picture covers."""
-        chosen = self._chosen()
+        chosen = self.places[self._number()]
+        self.taking.setEnabled(bool(chosen.footprint))
         for place, marker in zip(self.places, self.markers):  # noqa: B905 (as long as each other)
             marker.setColor(QColor("#e4572e" if place is chosen else "#1f6fb4"))
-        corners = self.finding.location["footprint_lonlat"] or [(-0.01, -0.01), (0.01, 0.01)]
-        middle = [sum(side) / len(corners) for side in zip(*corners)]  # noqa: B905 (longitudes and latitudes)
-        zoom([(chosen.lon + lon - middle[0], chosen.lat + lat - middle[1]) for lon, lat in corners], 2.0)
+        around = [(chosen.lon + side, chosen.lat + side) for side in (-0.01, 0.01)]
+        zoom(chosen.footprint or around, 2.0)
+
+    def take(self) -> None:
+        """Have the picture drawn at the selected place, by the same search."""
+        open_dialog(self.algorithm, {**self.finding.parameters, "TAKE": self._number() + 1}).runButton().click()
+        self.accept()
 
     def choose(self) -> None:
         """Open the dialog again, to search near the selected place alone."""
-        chosen = self._chosen()
+        chosen = self.places[self._number()]
         others = [_measure(chosen, place) for place in self.places if place is not chosen]
         near = {
             "NEAR": f"{chosen.lon!r},{chosen.lat!r} [{LONLAT}]",
