@@ -334,6 +334,8 @@ class Location:
         For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
     mirrored : bool
         The mask has this place turned over only, left to right: the homography mirrors.
+    part_read : str
+        What was read of a file that holds more: "band 2 (road) of 3", "page 1 of 2"; "" where that is all.
     stated_offset_m : float or None
         How far the middle lies from where the mask's own georeference puts it; None where it has none.
     command : str
@@ -372,6 +374,7 @@ class Location:
     options: dict[str, Any] | None = field(default=None, repr=False)
     reference_digest: str = ""
     command: str = field(default="", repr=False)
+    part_read: str = ""
     stated_offset_m: float | None = None
     evidence: Evidence | None = None
     seen: Seen | None = field(default=None, repr=False)
@@ -562,6 +565,7 @@ class Location:
             "camera": None if self.camera is None else self.camera.to_dict(),
             "mirrored": self.mirrored,
             "query_to_pixel": rows(self.query_to_pixel),
+            "part_read": self.part_read,
             "stated_offset_m": self.stated_offset_m,
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,

@@ -321,6 +321,8 @@ def describe(outcome: Outcome) -> str:
     else:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
         text = f"{query}: {status} at {where} on {visible(found['reference'])}: {visible(found['reason'])}"
+    if found.get("part_read"):
+        text += f"\n  read {visible(found['part_read'])}"
     if found.get("stated_offset_m") is not None:
         text += f"\n  its own georeference puts the middle {found['stated_offset_m']:,.1f} m from there"
     if outcome.photo and outcome.photo[0] != found["query"]:

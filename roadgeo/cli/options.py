@@ -335,8 +335,8 @@ _SHARED = {
         "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness, GeoDeep "
         "or STAC describe them. Several are fused. Default: the model that ships.",
         type=Plugin("roadgeo.segmenters", file_ending=".onnx"), multiple=True, rare=True),
-    "class_name": row("--class class_name", "NAME", IMAGE,
-        "Class of the model that is road. Default: by the names.", rare=True),
+    "class_name": row("--class class_name", "NAME|N", IMAGE,
+        "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True),
     "fuse": row("--fuse", "", IMAGE,
         "All images show one frame (exposures, masks of several models): fuse them.", rare=True),
     "threshold": row("--threshold", "T", IMAGE,

@@ -17,12 +17,17 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import width_by_area
 
-__all__ = ["Sample", "are_labels", "find_thresholds", "find_unlabelled", "ground_and_road", "spread_probability"]
+__all__ = [
+    *("Sample", "are_labels", "are_roads", "find_thresholds", "find_unlabelled", "ground_and_road"),
+    *("refuse_different_bands", "spread_probability"),
+]
 
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
 _CRISP_SHARE = 0.02  # less than this: a mask
 _MIN_CORRELATION = 0.3  # between the bands of a photograph
+_FAINT = 0.05  # bands whose values span less than this, of the widest span, show nothing; and so do such changes
+_FAR, _MOST_APART = 0.25, 0.1  # shares of the span between bands that differ in a pixel; and of the roads, such pixels
 _MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map, unless they are faint
 
 #: Values that are not crisp show roads only where (measured on soft maps and on the photographs of the Massachusetts
@@ -60,12 +65,15 @@ class Sample:
         The band to go by.
     read_rows : callable
         Returns (rows, columns) neighbouring values of that band, from the middle of the raster.
+    options : str
+        How a band is chosen, for people.
     """
 
     name: str
     seen: AnyArray
     channel: int
     read_rows: Callable[[], AnyArray]
+    options: str = "--band N"
 
     @cached_property
     def levels(self) -> AnyArray:
@@ -131,9 +139,9 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
         return None, ""
     other, are_two = float(others[0]), classes.tolist() == [0, 1]
     rows = sample.read_rows()
-    ones_are_roads, others_are = (_are_roads(rows == value) for value in (1, other))
+    onesare_roads, others_are = (are_roads(rows == value) for value in (1, other))
     listed = ", ".join(f"{level:g}" for level in (*classes, other))
-    if other > 0 and others_are and not (are_two and ones_are_roads):
+    if other > 0 and others_are and not (are_two and onesare_roads):
         return None, f"holds the values {listed}: {other:g} is taken for road"
     if are_two:
         return other, f"holds the values {listed}: 1 is taken for road, {other:g} for not observed"
@@ -188,7 +196,8 @@ def _refuse_classes(sample: Sample, levels: AnyArray) -> None:
         if len(levels) >= _MANY_LEVELS and _shows_roads(rows, _otsu(rows.ravel())):
             return
     listed = ", ".join(f"{level:g}" for level in levels)
-    raise MaskError(f"{sample.name}: holds the classes {listed}; expected road and no road: give a threshold or a mask")
+    what = f"{sample.name}: holds the classes {listed}; expected road and no road"
+    raise MaskError(f"{what}: give the one that is road with --class N, or a threshold")
 
 
 def _refuse_colours(sample: Sample, levels: AnyArray) -> None:
@@ -203,6 +212,29 @@ def _refuse_colours(sample: Sample, levels: AnyArray) -> None:
         )
 
 
+def refuse_different_bands(sample: Sample) -> None:
+    """Raise where bands show different things: classes one by one, a mask and its probability or count.
+
+    A photograph is left alone: it has three bands, none of which is crisp, and which do not add up to one value.
+    """
+    seen = sample.seen.astype(np.float64)
+    span = np.ptp(seen, axis=0)
+    shown = span > (_FAINT * span.max() if seen.shape[1] > 2 else 0.0)  # colours may have traces of others
+    if np.count_nonzero(shown) < 2:
+        return
+    shares = (seen - seen.min(axis=0))[:, shown] / span[shown]
+    is_crisp = (np.minimum(shares, 1.0 - shares) < _CRISP_SHARE).mean(axis=0) > 1.0 - _CRISP_SHARE
+    if shares.shape[1] > 2 and not is_crisp.any() and shares.sum(axis=1).std() > _FAINT:
+        return
+    first = shares[:, np.argmax(is_crisp)]
+    roads = min(np.mean(first > 0.5), np.mean(first <= 0.5))
+    apart = [min(np.mean(np.abs(band - like) > _FAR) for like in (first, 1.0 - first)) for band in shares.T]
+    if max(apart) > _MOST_APART * roads:
+        if seen.shape[1] == 3 and len(sample.levels) > 2:
+            _refuse_colours(sample, sample.levels)
+        raise _several_bands(sample)
+
+
 def _refuse_reflectances(sample: Sample, values: AnyArray) -> None:
     """Raise where numbers from 0 to 1 are no probability of road: a photograph's colours, or several classes'.
 
@@ -213,7 +245,12 @@ def _refuse_reflectances(sample: Sample, values: AnyArray) -> None:
         return
     if np.corrcoef(seen.T).min() > _MIN_CORRELATION:
         _grey_share(sample, values)
-    raise MaskError(f"{sample.name}: holds {seen.shape[1]} bands that differ; choose the one that holds the roads")
+    raise _several_bands(sample)
+
+
+def _several_bands(sample: Sample) -> MaskError:
+    what = f"{sample.name}: holds {sample.seen.shape[1]} bands that differ"
+    return MaskError(f"{what}; choose the one that holds the roads: {sample.options}")
 
 
 def _grey_share(sample: Sample, values: AnyArray) -> float:
@@ -259,7 +296,7 @@ def _shows_roads(rows: AnyArray, threshold: float) -> bool:
     return bool(n_pieces * width_by_area(RoadMask(light)) ** 2 <= _MAX_PIECES * n_light)
 
 
-def _are_roads(shown: BoolArray) -> bool:
+def are_roads(shown: BoolArray) -> bool:
     """Whether some of (rows, columns) look like roads."""
     return bool(0 < shown.mean() <= _MAX_LIGHT) and _shows_roads(shown.astype(np.float64), 0.5)
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.running.tasks import Task
+    from roadgeo.sources.bands import Choice
 
 __all__ = ["BatchOptions", "ReadOptions", "is_model"]
 
@@ -29,7 +30,10 @@ class ReadOptions:
     segmenters : tuple of str
         Plugins, and files of models (.onnx); several are fused. Default: the model that ships.
     class_name : str or None
-        The class of a model that is road. Default: by the names of its classes.
+        The class of a model that is road, or the number that stands for road in a map of classes. Default: by the names
+        of the model's classes.
+    names : tuple of str
+        Names of the bands of an array.
     fused_with : tuple of str
         Further images of the same frame, fused with each query.
     threads : int
@@ -58,6 +62,15 @@ class ReadOptions:
     layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
     bands: tuple[int, int, int] | None = None
+    names: tuple[str, ...] = ()
+
+    @property
+    def choice(self) -> Choice:
+        """What is read of a raster that may be a mask."""
+        from roadgeo.sources.bands import Choice
+
+        is_number = self.class_name is not None and self.class_name.isdecimal()
+        return Choice(self.band, int(str(self.class_name)) if is_number else None, self.names)
 
     @property
     def may_be_mask(self) -> bool:

@@ -24,7 +24,7 @@ def probability_path(paths: OutputPaths) -> Path:
 
 def is_ours(path: Path) -> bool:
     """Whether a file is a probability map that we wrote, not a mask of the user's."""
-    from roadgeo.sources.masks import PROBABILITY_TAG
+    from roadgeo.sources.bands import PROBABILITY_TAG
     from roadgeo.storage.rasters import open_raster
 
     if not path.is_file():

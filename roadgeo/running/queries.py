@@ -74,7 +74,8 @@ def _look_for(
         with _open_as_mask(path, reading) as mask:
             if mask is not None:
                 sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
-                return try_variants(sighting, references, options, reading, how)
+                sighting = try_variants(sighting, references, options, reading, how)
+                return replace(sighting, location=replace(sighting.location, part_read=mask.part))
     with as_file(path) as file:
         sighting = locate_photograph((file, *reading.fused_with), references, options, reading, how, say)
         if not isinstance(path, str):
@@ -147,7 +148,7 @@ def _open_as_mask(path: str | AnyArray, reading: ReadOptions) -> Iterator[MaskSo
         source = None
         if reading.may_be_mask and not (_is_chosen_by_values(reading) and _is_photograph(path)):
             try:
-                source = stack.enter_context(open_mask(path, band=reading.band, threshold=reading.threshold))
+                source = stack.enter_context(open_mask(path, choice=reading.choice, threshold=reading.threshold))
             except PhotographError:
                 if reading.segment == "never":
                     raise
@@ -155,8 +156,9 @@ def _open_as_mask(path: str | AnyArray, reading: ReadOptions) -> Iterator[MaskSo
 
 
 def _is_chosen_by_values(reading: ReadOptions) -> bool:
-    """Whether values decide what a path holds, though a threshold is given."""
-    return reading.segment == "auto" and reading.threshold is not None and reading.band is None
+    """Whether values decide what a path holds, though a threshold or a class is given."""
+    is_read = reading.threshold is not None or reading.choice.road_class is not None
+    return reading.segment == "auto" and is_read and reading.band is None
 
 
 def _is_photograph(path: str | AnyArray) -> bool:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,54 +18,30 @@ from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.thresholds import (
     Sample,
-    are_labels,
+    are_roads,
     find_thresholds,
     find_unlabelled,
     ground_and_road,
+    refuse_different_bands,
     spread_probability,
 )
 from roadgeo.roads.vectorization import road_width
+from roadgeo.sources.bands import Choice, Raster, open_bands
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
-from roadgeo.storage.rasters import open_raster, sidecar_nodata
 
-if TYPE_CHECKING:
-    from rasterio import DatasetReader
-
-__all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "MaskSource", "open_mask", "read_mask"]
+__all__ = ["MaskSource", "open_mask", "read_mask"]
 
 _LOG = logging.getLogger(__name__)
 
-#: Tags that mark our own maps of probability among masks that users made, and the threshold of their model.
-PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
-
 MIN_SIDE, MAX_SIDE = 32, 20_000
-_MAX_CLASSES = 32  # whose colours a palette holds
-_MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded in strips of this size
 _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are interpreted
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _MAX_ROAD_SHARE = 0.35  # of a frame
+_MOST_LISTED = 8
 
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
-
-
-@dataclass(frozen=True)
-class _Raster:
-    """A raster's values, not necessarily in memory. Dimensions: H rows, W columns, B bands (alpha left out).
-
-    `read(top, bottom, step)` returns every `step`-th value of these rows as (rows, columns, B), and where they are
-    valid as (rows, columns) bool, or None for everywhere. `has_alpha`: they are valid where they are not transparent.
-    `n_unread`: bands beyond those that are read. `model_threshold`: of a map of probability that we wrote.
-    """
-
-    name: str
-    shape: tuple[int, int]
-    n_bands: int
-    read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
-    has_alpha: bool = False
-    n_unread: int = 0
-    model_threshold: float | None = None
 
 
 def read_mask(
@@ -106,7 +80,7 @@ def read_mask(
     MaskError
         The file is missing or no raster; or it is empty, too small, too large, or of several classes.
     """
-    with open_mask(source, band=band, threshold=threshold, name=name, voids=voids) as opened:
+    with open_mask(source, choice=Choice(band), threshold=threshold, name=name, voids=voids) as opened:
         return opened.read(opened.thresholds[0])
 
 
@@ -118,13 +92,16 @@ class MaskSource:
     ----------
     thresholds : tuple of float
         Those worth trying, the most promising first; one for a mask.
+    part : str
+        What is read of a raster that holds more, for people: "band 2 (road) of 3"; "" where all bands are alike.
     """
 
     thresholds: tuple[float, ...]
-    _raster: _Raster
+    _raster: Raster
     _channel: int
     _voids: bool
     _levels: tuple[float, float] | None  # a soft map's values of ground and of road
+    part: str = ""
 
     def read(self, threshold: float) -> RoadMask:
         """Read where values lie above a threshold as road.
@@ -161,13 +138,14 @@ class MaskSource:
 def open_mask(
     source: str | os.PathLike[str] | AnyArray,
     *,
-    band: int | None = None,
+    choice: Choice | None = None,
     threshold: float | None = None,
     name: str | None = None,
     voids: bool = True,
 ) -> Iterator[MaskSource]:
-    """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
-    with _open(source, band, name) as raster:
+    """Open a road mask or a soft map of roads: other parameters and errors as of `read_mask`."""
+    choice = choice or Choice()
+    with open_bands(source, choice, name) as raster:
         _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
         own = raster.model_threshold
         if own is not None and threshold is None:
@@ -175,35 +153,90 @@ def open_mask(
             yield MaskSource(values, raster, 0, False, (0.0, float(PROBABILITY_SURE)))
             return
         _require_mask(raster)
+        if choice.road_class is not None:
+            raster = _of_class(raster, choice.road_class)
         raster = _drawn(raster)
         seen = _sample(raster)
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
-        sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel))
+        sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
+        refuse_different_bands(sample)
         if threshold is None:
             raster, sample = _without_unlabelled(raster, sample)
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
         levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
-        yield MaskSource(thresholds, raster, channel, voids, levels)
+        yield MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, seen, channel, choice))
 
 
-def _drawn(raster: _Raster) -> _Raster:
-    """Take the opaque pixels for roads where they are of one dark colour: black roads on transparent ground."""
-    if not raster.has_alpha:
-        return raster
+def _part_of(raster: Raster, seen: AnyArray, channel: int, choice: Choice) -> str:
+    """Return which band of (n, B) values is read, and which class, where there are others."""
+    total, are_alike = len(raster.all_bands), not raster.is_chosen and (seen == seen[:, :1]).all()
+    band = "" if total < 2 or are_alike else f"band {raster.bands[channel]} of {total}"
+    return ", ".join(filter(None, [band, "" if choice.road_class is None else f"class {choice.road_class}"]))
+
+
+def _drawn(raster: Raster) -> Raster:
+    """Take what shows roads by being there, or by not being there, for roads.
+
+    The first are opaque pixels of one dark colour: black roads on transparent ground. The second are nodata, masked or
+    transparent pixels that look like roads on ground of one value, or in a soft map with values below theirs.
+    """
     step = _sample_step(raster)
     parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
-    opaque = np.concatenate([_finite(*part).ravel() for part in parts])
-    values = np.concatenate([values[_finite(values, valid)] for values, valid in parts])
-    if not 0 < opaque.mean() <= _MAX_ROAD_SHARE or values.any():
+    if all(valid is None and values.dtype.kind != "f" for values, valid in parts):
         return raster
+    finite = [_finite(*part) for part in parts]
+    seen = np.concatenate([values[known] for (values, _), known in zip(parts, finite, strict=True)])
+    hidden = np.concatenate([values[~known] for (values, _), known in zip(parts, finite, strict=True)])
+    share = len(seen) / max(len(seen) + len(hidden), 1)
+    if raster.has_alpha and 0 < share <= _MAX_ROAD_SHARE and not seen.any():
+        return replace(raster, read=_where(raster, True), n_bands=1)
+    middle, valid = _middle(raster)
+    shown = ~_finite(middle, valid)
+    edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
+    if not 1 - _MAX_ROAD_SHARE <= share < 1 or max(edge.mean() for edge in edges) > 0.5 or not are_roads(shown):
+        return raster
+    if (seen == seen[0]).all():
+        _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", visible(raster.name))
+        return replace(raster, read=_where(raster, False), n_bands=1)
+    is_lightest = seen.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > seen.max()
+    if not is_lightest or len(np.unique(seen)) <= 2:
+        return raster
+    _LOG.warning("%s: its lightest pixels are nodata: they are taken for roads, too", visible(raster.name))
+    return replace(raster, read=lambda *rows: (raster.read(*rows)[0], None))
+
+
+def _where(raster: Raster, observed: bool) -> Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]:
+    """Return what reads as roads the pixels of a raster that were observed, or those that were not."""
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        return _finite(*raster.read(top, bottom, step)).view(np.uint8)[..., None], None
+        return (_finite(*raster.read(top, bottom, step)) == observed).view(np.uint8)[..., None], None
 
-    return _Raster(raster.name, raster.shape, 1, read)
+    return read
 
 
-def _without_unlabelled(raster: _Raster, sample: Sample) -> tuple[_Raster, Sample]:
+def _of_class(raster: Raster, number: int) -> Raster:
+    """Take the pixels of one class for roads.
+
+    Raises
+    ------
+    MaskError
+        There are none of them, or several bands.
+    """
+    if raster.n_bands > 1:
+        raise MaskError(f"{raster.name}: has several bands; choose the one that holds the classes: {raster.options}")
+    classes = np.unique(_sample(raster))
+    if number not in classes:
+        listed = ", ".join(f"{value:g}" for value in classes[:_MOST_LISTED])
+        raise MaskError(f"{raster.name}: holds no value {number}, but {listed}; give the one that is road with --class")
+
+    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
+        values, valid = raster.read(top, bottom, step)
+        return (values == number).view(np.uint8), _finite(values, valid)
+
+    return replace(raster, read=read)
+
+
+def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]:
     """Leave out pixels without a label in a map of labels, and report how its values were read."""
     unlabelled, reason = find_unlabelled(sample)
     if reason:
@@ -221,11 +254,11 @@ def _without_unlabelled(raster: _Raster, sample: Sample) -> tuple[_Raster, Sampl
     return labelled, replace(sample, seen=seen, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
 
 
-def _sample_step(raster: _Raster) -> int:
+def _sample_step(raster: Raster) -> int:
     return int(np.ceil(np.sqrt(raster.shape[0] * raster.shape[1] / _SAMPLE_PIXELS)))
 
 
-def _sample(raster: _Raster) -> AnyArray:
+def _sample(raster: Raster) -> AnyArray:
     """Return (n, B) observed values, from all over a raster."""
     step = _sample_step(raster)
     parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
@@ -235,7 +268,7 @@ def _sample(raster: _Raster) -> AnyArray:
     return seen
 
 
-def _middle(raster: _Raster) -> tuple[AnyArray, BoolArray | None]:
+def _middle(raster: Raster) -> tuple[AnyArray, BoolArray | None]:
     """Read the rows in the middle of a raster: (rows, columns, B), and where they are valid."""
     height, width = raster.shape
     rows = min(height, max(_MIDDLE_PIXELS // width, MIN_SIDE))
@@ -250,7 +283,7 @@ def _numbers(values: AnyArray, valid: BoolArray | None, channel: int) -> AnyArra
     return chosen if finite.all() else np.where(finite, chosen, chosen[finite].min() if finite.any() else 0)
 
 
-def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
+def _separate(raster: Raster, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
     """Return where values of a band lie above the threshold, and where they are valid."""
     roads = np.zeros(raster.shape, np.bool_)
     observed = None
@@ -270,7 +303,7 @@ def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArra
     return roads, observed
 
 
-def _between(raster: _Raster, channel: int, ground: float, road: float) -> AnyArray:
+def _between(raster: Raster, channel: int, ground: float, road: float) -> AnyArray:
     """Return where values of a band lie between ground and road, as `RoadMask.probability`."""
     shares = np.full(raster.shape, PROBABILITY_UNKNOWN, np.uint8)
     for strip in _strips(raster, 1):
@@ -281,7 +314,7 @@ def _between(raster: _Raster, channel: int, ground: float, road: float) -> AnyAr
     return shares
 
 
-def _strips(raster: _Raster, step: int) -> Iterator[slice]:
+def _strips(raster: Raster, step: int) -> Iterator[slice]:
     """Cut the rows into strips that are read at a time, each of a multiple of `step` rows."""
     height, width = raster.shape
     rows = step * max(1, _STRIP_PIXELS // (width * raster.n_bands * step))
@@ -340,16 +373,6 @@ def _without_border(
     return roads & on_map, on_map if observed is None else observed & on_map
 
 
-@contextmanager
-def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str | None) -> Iterator[_Raster]:
-    """Open a source for reading."""
-    if not isinstance(source, str | os.PathLike):
-        yield _of_array(np.ma.asanyarray(source), band, name or "array")
-        return
-    with open_raster(source, name) as dataset:
-        yield _of_dataset(dataset, band, name or os.fspath(source), sidecar_nodata(source))
-
-
 def _require_size(name: str, height: int, width: int, most: int) -> None:
     """Refuse by its header what is too small to show roads, or too large to decode."""
     low, high = min(height, width), max(height, width)
@@ -360,13 +383,13 @@ def _require_size(name: str, height: int, width: int, most: int) -> None:
         )
 
 
-def _require_mask(raster: _Raster) -> None:
+def _require_mask(raster: Raster) -> None:
     """Refuse what has more pixels or bands than a mask, as a photograph if its middle rows look like one."""
     if max(raster.shape) <= MAX_SIDE and raster.n_unread == 0:
         return
     values, valid = _middle(raster)
     seen = _observed(values, valid)
-    many = f"{raster.name}: has {raster.n_bands + raster.n_unread} bands; choose the one that holds the roads"
+    many = f"{raster.name}: has {len(raster.all_bands)} bands; choose the one that holds the roads"
     try:
         if len(seen):
             channel = int(np.argmax(seen.std(axis=0)))
@@ -378,95 +401,4 @@ def _require_mask(raster: _Raster) -> None:
     except MaskError:
         pass  # the error below comes first
     _require_size(raster.name, *raster.shape, MAX_SIDE)
-    raise MaskError(many)
-
-
-def _of_array(array: AnyArray, band: int | None, name: str) -> _Raster:
-    """Wrap an (H, W) or (H, W, bands) array."""
-    if array.ndim not in (2, 3) or array.dtype.kind not in "biuf" or array.size == 0:
-        raise MaskError(
-            f"{name}: an array of shape {array.shape} and type {array.dtype}; expected (rows, columns) or "
-            "(rows, columns, bands) of numbers or booleans"
-        )
-    whole = array if array.ndim == 3 else array[..., None]
-    data = np.ma.getdata(whole)
-    valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
-    chosen = _bands(name, band, data.shape[2])
-    n_unread = 0 if band is not None else data.shape[2] - len(chosen)
-    data = data[..., chosen]
-    if data.dtype == np.bool_:
-        data = data.view(np.uint8)
-
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        rows = slice(top, bottom, step)
-        return data[rows, ::step], None if valid is None else valid[rows, ::step]
-
-    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, n_unread=n_unread)
-
-
-def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
-    """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
-    from rasterio.enums import ColorInterp, MaskFlags
-    from rasterio.windows import Window
-
-    colour = [
-        i for i, meaning in zip(dataset.indexes, dataset.colorinterp, strict=True) if meaning != ColorInterp.alpha
-    ]
-    if not colour:
-        raise MaskError(f"{name}: holds no band of values; give an image or GeoTIFF")
-    chosen = [colour[i] for i in _bands(name, band, len(colour))]
-    kinds = {str(dataset.dtypes[i - 1]) for i in chosen}
-    if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
-        raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
-    palette = _palette(dataset, colour[0]) if len(colour) == 1 else None
-    all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
-
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        window = Window(0, top, dataset.width, bottom - top)
-        # Every step-th value of all, for to read fewer GDAL would go to overviews: blurred, or of another file.
-        values = np.moveaxis(dataset.read(chosen, window=window)[:, ::step, ::step], 0, 2)
-        valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > 0
-        if nodata is not None and dataset.nodata is None:
-            known = (values != nodata).all(axis=2)
-            valid = known if valid is None else valid & known
-        if palette is None:
-            return values, valid
-        shown = palette[values[..., 0]]
-        return shown[..., :3], shown[..., 3] > 0 if valid is None else valid & (shown[..., 3] > 0)
-
-    has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
-    n_unread = 0 if band is not None else len(colour) - len(chosen)
-    n_bands = len(chosen) if palette is None else 3
-    return _Raster(name, (dataset.height, dataset.width), n_bands, read, has_alpha, n_unread, _model_threshold(dataset))
-
-
-def _model_threshold(dataset: DatasetReader) -> float | None:
-    """Return the threshold of the model that made a map of probability, where that is one that we wrote."""
-    tags = dataset.tags()
-    if PROBABILITY_TAG not in tags or dataset.count != 1 or dataset.dtypes[0] != "uint8":
-        return None
-    with contextlib.suppress(ValueError):
-        threshold = float(tags.get(THRESHOLD_TAG, ""))
-        return threshold if 0.0 < threshold < 1.0 else None
-    return None
-
-
-def _palette(dataset: DatasetReader, band: int) -> AnyArray | None:
-    """Return the (256, 4) colours that values stand for; None where the values mean what they are, as classes do."""
-    if dataset.dtypes[band - 1] != "uint8" or dataset.colorinterp[band - 1].name != "palette":
-        return None
-    colours = dataset.colormap(band)
-    palette = np.array([colours.get(value, (0, 0, 0, 255)) for value in range(256)], np.uint8)
-    used = np.unique(dataset.read(band))
-    shown = palette[used, :3]
-    is_picture = len(used) > _MAX_CLASSES or (shown == shown[:, :1]).all()  # or greys
-    return palette if is_picture and not are_labels(used) else None
-
-
-def _bands(name: str, band: int | None, n_bands: int) -> list[int]:
-    """Return the numbers from 0 of the bands to look at: the chosen one, or the first three."""
-    if band is not None:
-        if not 1 <= band <= n_bands:
-            raise MaskError(f"{name}: has no band {band}; expected 1 to {n_bands}")
-        return [band - 1]
-    return list(range(min(n_bands, _MAX_BANDS)))
+    raise MaskError(f"{many}: {raster.options}")

@@ -19,7 +19,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.running import photographs, queries
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
-from roadgeo.sources.masks import PROBABILITY_TAG
+from roadgeo.sources.bands import PROBABILITY_TAG
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import rank_scales
 from roadgeo.sources.segmentation.tiling import segment

@@ -13,6 +13,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
+from roadgeo.sources.bands import Choice
 from roadgeo.sources.masks import open_mask, read_mask
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -320,10 +321,12 @@ def test_a_photograph_of_many_bands_is_none_the_less_one(tmp_path: Path, roads: 
     with pytest.raises(PhotographError, match="has 4 bands; choose the one that holds the roads, if it is a mask"):
         read_mask(path)
     stack = tiff(tmp_path / "stack.tif", np.stack([roads * np.uint8(255)] * 4), photometric="MINISBLACK")
-    with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads$") as refused:
+    with pytest.raises(
+        MaskError, match=r"has 4 bands; choose the one that holds the roads: --band 1, 2, 3, 4$"
+    ) as refused:
         read_mask(stack)
     assert not isinstance(refused.value, PhotographError)
-    with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads$"):
+    with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads: --band 1, 2, 3, 4$"):
         read_mask(tiff(tmp_path / "nothing.tif", np.full((4, *SHAPE), np.nan, np.float32)))
 
 
@@ -542,3 +545,178 @@ def test_reading_warns_of_nothing(tmp_path: Path, roads: np.ndarray, recwarn: py
     recwarn.clear()
     read_mask(path)
     assert not [w for w in recwarn if issubclass(w.category, NotGeoreferencedWarning)]
+
+
+# --- several bands that differ ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def houses() -> np.ndarray:
+    """Blocks between the streets."""
+    image = np.zeros(SHAPE, bool)
+    image[35:60, 45:65] = image[40:70, 5:25] = True
+    return image
+
+
+def stack(kind: str, roads: np.ndarray, houses: np.ndarray) -> np.ndarray:
+    """Return (bands, H, W) of which the one at `ROAD_BAND` shows the roads."""
+    rng = np.random.default_rng(0)
+    soft = np.clip(cv2.GaussianBlur(roads.astype(np.float32), (0, 0), 1.0), 0, 1)
+    return {
+        "road, building": np.stack([roads, houses]).astype(np.uint8) * 255,
+        "building, road": np.stack([houses, roads]).astype(np.uint8),
+        "one-hot": np.stack([~roads & ~houses, houses, roads]).astype(np.uint8),
+        "softmax": np.stack([1 - np.maximum(soft, houses), houses * (1 - soft), soft]).astype(np.float32),
+        "softmax in bytes": np.rint(255 * np.stack([(1 - soft) * ~houses, (1 - soft) * houses, soft])).astype(np.uint8),
+        "mask, percent": np.stack([roads, 100 * np.clip(soft + rng.normal(0, 0.1, SHAPE), 0, 1)]).astype(np.uint8),
+        "mask, count": np.stack([roads, rng.poisson(9, SHAPE)]).astype(np.uint16),
+        "mask, age": np.stack([roads, rng.gamma(2, 400, SHAPE)]).astype(np.float32),
+        "two probabilities": np.rint(255 * np.stack([soft, cv2.blur(1.0 * houses, (9, 9))])).astype(np.uint8),
+    }[kind]  # fmt: skip
+
+
+ROAD_BAND = {"building, road": 1, "one-hot": 2, "softmax": 2, "softmax in bytes": 2}
+STACKS = [
+    *("road, building", "building, road", "one-hot", "softmax", "softmax in bytes", "mask, percent", "mask, count"),
+    *("mask, age", "two probabilities"),
+]
+
+
+@pytest.mark.parametrize("where", ["tif", "array"])
+@pytest.mark.parametrize("kind", STACKS)
+def test_bands_that_differ_are_asked_for(
+    tmp_path: Path, roads: np.ndarray, houses: np.ndarray, kind: str, where: str
+) -> None:
+    bands = stack(kind, roads, houses)
+    source = np.moveaxis(bands, 0, 2) if where == "array" else tiff(tmp_path / "a.tif", bands, photometric="MINISBLACK")
+    with pytest.raises(MaskError, match=f"{len(bands)} bands that differ; choose .* roads: --band 1, 2") as refused:
+        read_mask(source)
+    assert not isinstance(refused.value, PhotographError)
+    found = read_mask(source, band=ROAD_BAND.get(kind, 0) + 1)
+    assert np.mean(found.roads != roads) < 0.02
+
+
+@pytest.mark.parametrize("kind", STACKS)
+def test_the_band_that_is_named_road_is_read(tmp_path: Path, roads: np.ndarray, houses: np.ndarray, kind: str) -> None:
+    bands = stack(kind, roads, houses)
+    number = ROAD_BAND.get(kind, 0)
+    names = ["other_class", "background", "rural"][: len(bands)]
+    names[number] = "Road_mask"
+    path = tiff(tmp_path / "a.tif", bands, photometric="MINISBLACK")
+    with rasterio.open(path, "r+") as file:
+        file.descriptions = names
+    with open_mask(path) as opened:
+        assert opened.part == f"band {number + 1} (Road_mask) of {len(bands)}"
+        assert np.mean(opened.read(opened.thresholds[0]).roads != roads) < 0.02
+    names[number] = "band of no name"
+    with rasterio.open(path, "r+") as file:
+        file.descriptions = names
+    with pytest.raises(MaskError, match=r"--band 1 \((other_class|band of no name)\), 2 \("):
+        read_mask(path)
+    names[number] = "roads"
+    with open_mask(np.moveaxis(bands, 0, 2), choice=Choice(names=tuple(names))) as opened:
+        assert opened.part == f"band {number + 1} (roads) of {len(bands)}"
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen"),
+    [
+        (("road", "road_uncertainty"), 1),
+        (("not_road", "road"), 2),
+        (("estradas", "edificios"), 1),
+        (("Straßen", "Gebäude"), 1),
+        (("mask", "street probability"), 2),
+        (("class_0", "highways", "railroad crossing"), 2),
+        (("road a", "road b"), None),
+        (("railroad", "rural"), None),
+        (("", ""), None),
+    ],
+)
+def test_names_of_bands(roads: np.ndarray, houses: np.ndarray, names: tuple[str, ...], chosen: int | None) -> None:
+    bands = np.dstack([roads, houses, ~roads][: len(names)]).astype(np.uint8)
+    if chosen is None:
+        with pytest.raises(MaskError, match="bands that differ"), open_mask(bands, choice=Choice(names=names)):
+            pass
+        return
+    with open_mask(bands, choice=Choice(names=names)) as opened:
+        assert opened.part.startswith(f"band {chosen} ")
+
+
+def test_colours_of_a_png_are_bands(tmp_path: Path, roads: np.ndarray, houses: np.ndarray) -> None:
+    path = tmp_path / "classes.png"
+    cv2.imwrite(str(path), np.dstack([roads & False, roads, houses]).astype(np.uint8) * 255)
+    with pytest.raises(MaskError, match=r"--band 1 \(red\), 2 \(green\), 3 \(blue\)"):
+        read_mask(path)
+    np.testing.assert_array_equal(read_mask(path, band=2).roads, roads)
+
+
+@pytest.mark.parametrize(
+    "colours", [((0, 0, 0), (255, 0, 0)), ((0, 128, 0), (255, 255, 255)), ((9, 40, 9), (250, 0, 90))]
+)
+def test_two_colours_are_road_and_no_road(roads: np.ndarray, colours: tuple[tuple[int, ...], ...]) -> None:
+    np.testing.assert_array_equal(read_mask(np.array(colours, np.uint8)[roads.astype(int)]).roads, roads)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int32, np.float32])
+def test_a_class_is_chosen(tmp_path: Path, roads: np.ndarray, houses: np.ndarray, kind: type) -> None:
+    classes = (3 * roads + 2 * (houses & ~roads)).astype(kind)
+    if kind is np.float32:
+        classes += 40
+    else:
+        with pytest.raises(MaskError, match=r"holds the classes 0, 2, 3; expected road .* --class N"):
+            read_mask(classes)
+    number = int(classes.max())
+    path = tiff(tmp_path / "classes.tif", classes[None])
+    with open_mask(path, choice=Choice(road_class=number)) as opened:
+        assert opened.part == f"class {number}"
+        np.testing.assert_array_equal(opened.read(opened.thresholds[0]).roads, roads)
+    with pytest.raises(MaskError, match=r"holds no value 7, but \d+, \d+, \d+; give the one that is road with --class"):
+        open_mask(path, choice=Choice(road_class=7)).__enter__()
+
+
+# --- nodata that is the roads' value ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ground_value", [0, 255])
+@pytest.mark.parametrize("kind", ["nodata", "sidecar", "nan", "masked", "alpha", "soft"])
+def test_roads_that_are_called_nodata_are_roads(
+    tmp_path: Path, roads: np.ndarray, caplog: pytest.LogCaptureFixture, kind: str, ground_value: int
+) -> None:
+    values = np.where(roads, 255 - ground_value, ground_value).astype(np.uint8)
+    if kind == "nodata":
+        source = tiff(tmp_path / "a.tif", values[None], nodata=255 - ground_value)
+    elif kind == "sidecar":
+        source = tmp_path / "a.png"
+        cv2.imwrite(str(source), values)
+        note = f"<NoDataValue>{255 - ground_value}</NoDataValue>"
+        Path(f"{source}.aux.xml").write_text(f'<PAMDataset><PAMRasterBand band="1">{note}</PAMRasterBand></PAMDataset>')
+    elif kind == "nan":
+        source = np.where(roads, np.nan, float(ground_value))
+    elif kind == "masked":
+        source = np.ma.masked_array(values, roads)
+    elif kind == "alpha":
+        source = tmp_path / "a.png"
+        cv2.imwrite(str(source), np.dstack([np.full(SHAPE, ground_value, np.uint8)] * 3 + [~roads * np.uint8(255)]))
+    else:
+        if ground_value:
+            pytest.skip("light roads only")
+        soft = np.maximum(roads * np.uint8(255), np.rint(180 * cv2.GaussianBlur(roads.astype(np.float32), (0, 0), 1.0)))
+        source = tiff(tmp_path / "a.tif", soft.astype(np.uint8)[None], nodata=255)
+    assert np.mean(read_mask(source, voids=False).roads != roads) < 0.02
+    assert "are taken for roads" in caplog.text
+
+
+@pytest.mark.parametrize("where", [np.s_[:, 70:], np.s_[:9], np.s_[20:60, 30:70]])
+def test_nodata_of_another_shape_is_no_road(where: tuple[slice, ...]) -> None:
+    hidden = np.zeros(SHAPE, bool)
+    hidden[where] = True
+    with pytest.raises(MaskError, match="shows no road"):
+        read_mask(np.ma.masked_array(np.zeros(SHAPE, np.uint8), hidden))
+
+
+def test_an_ignored_border_of_roads_is_no_road(tmp_path: Path, roads: np.ndarray) -> None:
+    """Labels as of PASCAL VOC: 255 around each object."""
+    wide = cv2.dilate(roads.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    labels = np.where(roads, 1, np.where(wide, 255, 0)).astype(np.uint8)
+    found = read_mask(tiff(tmp_path / "a.tif", labels[None], nodata=255), voids=False)
+    np.testing.assert_array_equal(found.roads, roads)

@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
-from roadgeo.sources.masks import PROBABILITY_TAG, THRESHOLD_TAG
+from roadgeo.sources.bands import PROBABILITY_TAG, THRESHOLD_TAG
 from roadgeo.storage.files import replacing
 from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright
 

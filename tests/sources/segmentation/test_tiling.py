@@ -12,7 +12,8 @@ from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import spread_probability
-from roadgeo.sources.masks import PROBABILITY_TAG, open_mask, read_mask
+from roadgeo.sources.bands import PROBABILITY_TAG
+from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph

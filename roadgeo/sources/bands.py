@@ -1,0 +1,219 @@
+"""The bands of values of a file or an array as they are stored, and the ones among them to look at for roads."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.errors import MaskError
+from roadgeo.roads.thresholds import are_labels
+from roadgeo.storage.rasters import open_raster, sidecar_nodata
+
+if TYPE_CHECKING:
+    from rasterio import DatasetReader
+
+__all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "Choice", "Raster", "open_bands"]
+
+#: Tags that mark our own maps of probability among masks that users made, and the threshold of their model.
+PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
+
+_MAX_CLASSES = 32  # whose colours a palette holds
+_MAX_BANDS = 3  # of a mask, unless one of them is chosen
+_MOST_LISTED = 8
+
+#: Words for roads in names of bands, and words for what is said of roads, or for all else.
+_ROADS = re.compile(r"\b(?:road|street|highway|stra(?:ss|ß)e|route|estrada|carreter|calle|strad[ae])[^\W\d]*", re.I)
+_OTHERS = re.compile(r"\b(?:no|non|not|off|age|background|distance|count|uncertain\w*|std|var\w*|entropy)\b", re.I)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is to be read of a raster.
+
+    Attributes
+    ----------
+    band : int or None
+        Counted from 1. Default: the band whose name is a word for roads, or else the first three.
+    road_class : int or None
+        The value that stands for road in a map of classes.
+    names : tuple of str
+        Names of an array's bands.
+    """
+
+    band: int | None = None
+    road_class: int | None = None
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A raster's values, not necessarily in memory. Dimensions: H rows, W columns, B bands (alpha left out).
+
+    Attributes
+    ----------
+    read : callable
+        `read(top, bottom, step)` returns every `step`-th value of these rows as (rows, columns, B), and where they are
+        valid as (rows, columns) bool, or None for everywhere.
+    bands : (B,) tuple of str
+        Number and name of each band that is read, for people: "2 (road)".
+    all_bands : tuple of str
+        The same of all bands.
+    has_alpha : bool
+        Values are valid where they are not transparent.
+    model_threshold : float or None
+        Of a map of probability that we wrote.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    n_bands: int
+    read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
+    bands: tuple[str, ...] = ()
+    all_bands: tuple[str, ...] = ()
+    has_alpha: bool = False
+    is_chosen: bool = False
+    model_threshold: float | None = None
+
+    @property
+    def n_unread(self) -> int:
+        """Bands beyond those that are read, where none was chosen."""
+        return 0 if self.is_chosen else max(len(self.all_bands) - len(self.bands), 0)
+
+    @property
+    def options(self) -> str:
+        """How a band is chosen, for people."""
+        shown = ", ".join(self.all_bands[:_MOST_LISTED])
+        return f"--band {shown}" + (" ..." if len(self.all_bands) > _MOST_LISTED else "")
+
+
+@contextmanager
+def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: str | None) -> Iterator[Raster]:
+    """Open a file or an array (H, W) or (H, W, bands).
+
+    Raises
+    ------
+    MaskError
+        It cannot be read, holds no numbers, or lacks the band.
+    """
+    if not isinstance(source, str | os.PathLike):
+        yield _of_array(np.ma.asanyarray(source), choice, name or "array")
+        return
+    with open_raster(source, name) as dataset:
+        yield _of_dataset(dataset, choice, name or os.fspath(source), sidecar_nodata(source))
+
+
+def _of_array(array: AnyArray, choice: Choice, name: str) -> Raster:
+    """Wrap an (H, W) or (H, W, bands) array."""
+    if array.ndim not in (2, 3) or array.dtype.kind not in "biuf" or array.size == 0:
+        raise MaskError(
+            f"{name}: an array of shape {array.shape} and type {array.dtype}; expected (rows, columns) or "
+            "(rows, columns, bands) of numbers or booleans"
+        )
+    whole = array if array.ndim == 3 else array[..., None]
+    data = np.ma.getdata(whole)
+    valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
+    labels = _labels(choice.names if len(choice.names) == data.shape[2] else [""] * data.shape[2])
+    chosen, is_chosen = _choose(name, choice, labels)
+    data = data[..., chosen]
+    if data.dtype == np.bool_:
+        data = data.view(np.uint8)
+
+    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
+        rows = slice(top, bottom, step)
+        return data[rows, ::step], None if valid is None else valid[rows, ::step]
+
+    bands = tuple(labels[i] for i in chosen)
+    return Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, bands, labels, is_chosen=is_chosen)
+
+
+def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Raster:
+    """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
+    from rasterio.enums import ColorInterp, MaskFlags
+    from rasterio.windows import Window
+
+    colour = [
+        i for i, meaning in zip(dataset.indexes, dataset.colorinterp, strict=True) if meaning != ColorInterp.alpha
+    ]
+    if not colour:
+        raise MaskError(f"{name}: holds no band of values; give an image or GeoTIFF")
+    meanings = [dataset.colorinterp[i - 1].name for i in colour]
+    is_coloured = {"red", "green", "blue"} <= {*meanings}
+    labels = _labels(
+        [dataset.descriptions[i - 1] or (meanings[n] if is_coloured else "") for n, i in enumerate(colour)]
+    )
+    picked, is_chosen = _choose(name, choice, labels)
+    chosen = [colour[i] for i in picked]
+    kinds = {str(dataset.dtypes[i - 1]) for i in chosen}
+    if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
+        raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
+    palette = _palette(dataset, colour[0]) if len(colour) == 1 and choice.road_class is None else None
+    all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
+
+    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
+        window = Window(0, top, dataset.width, bottom - top)
+        # Every step-th value of all, for to read fewer GDAL would go to overviews: blurred, or of another file.
+        values = np.moveaxis(dataset.read(chosen, window=window)[:, ::step, ::step], 0, 2)
+        valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > 0
+        if nodata is not None and dataset.nodata is None:
+            known = (values != nodata).all(axis=2)
+            valid = known if valid is None else valid & known
+        if palette is None:
+            return values, valid
+        shown = palette[values[..., 0]]
+        return shown[..., :3], shown[..., 3] > 0 if valid is None else valid & (shown[..., 3] > 0)
+
+    has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
+    bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
+    size, own = (dataset.height, dataset.width), _model_threshold(dataset)
+    return Raster(name, size, len(bands), read, bands, labels, has_alpha, is_chosen, own)
+
+
+def _model_threshold(dataset: DatasetReader) -> float | None:
+    """Return the threshold of the model that made a map of probability, where that is one that we wrote."""
+    tags = dataset.tags()
+    if PROBABILITY_TAG not in tags or dataset.count != 1 or dataset.dtypes[0] != "uint8":
+        return None
+    with contextlib.suppress(ValueError):
+        threshold = float(tags.get(THRESHOLD_TAG, ""))
+        return threshold if 0.0 < threshold < 1.0 else None
+    return None
+
+
+def _palette(dataset: DatasetReader, band: int) -> AnyArray | None:
+    """Return the (256, 4) colours that values stand for; None where the values mean what they are, as classes do."""
+    if dataset.dtypes[band - 1] != "uint8" or dataset.colorinterp[band - 1].name != "palette":
+        return None
+    colours = dataset.colormap(band)
+    palette = np.array([colours.get(value, (0, 0, 0, 255)) for value in range(256)], np.uint8)
+    used = np.unique(dataset.read(band))
+    shown = palette[used, :3]
+    is_picture = len(used) > _MAX_CLASSES or (shown == shown[:, :1]).all()  # or greys
+    return palette if is_picture and not are_labels(used) else None
+
+
+def _labels(names: Sequence[str]) -> tuple[str, ...]:
+    """Return number and name of each band."""
+    return tuple(f"{n} ({name.strip()})" if name and name.strip() else f"{n}" for n, name in enumerate(names, 1))
+
+
+def _choose(name: str, choice: Choice, labels: Sequence[str]) -> tuple[list[int], bool]:
+    """Return the numbers from 0 of the bands to look at, and whether one was chosen: by the user, or by its name."""
+    if choice.band is not None:
+        if not 1 <= choice.band <= len(labels):
+            raise MaskError(f"{name}: has no band {choice.band}; expected 1 to {len(labels)}")
+        return [choice.band - 1], True
+    texts = [label.replace("_", " ") for label in labels]
+    alone = [
+        i for i, text in enumerate(texts) if re.fullmatch(r"[\W\d]*", _ROADS.sub("", text)) and _ROADS.search(text)
+    ]
+    among = [i for i, text in enumerate(texts) if _ROADS.search(text) and not _OTHERS.search(text)]
+    named = next((found for found in (alone, among) if len(found) == 1), None)
+    return named or list(range(min(len(labels), _MAX_BANDS))), named is not None
