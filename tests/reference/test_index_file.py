@@ -1,6 +1,7 @@
 """The index file: round trip, and every way in which one can be damaged or hostile."""
 
 import errno
+import io
 import json
 import os
 import pickle
@@ -397,3 +398,9 @@ def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"nowhere.*create the folder"):
         write_index(tmp_path / "nowhere" / "town.index", {}, {})
+
+
+def test_the_unpickler_knows_no_names(tmp_path: Path) -> None:
+    with pytest.raises(pickle.UnpicklingError, match=r"mkdir"):
+        plain_values.PlainUnpickler(io.BytesIO(pickle.dumps(Reduce(tmp_path / "called")))).load()
+    assert not (tmp_path / "called").exists()

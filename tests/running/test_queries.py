@@ -1,6 +1,7 @@
 """Photographs are recognised, segmented and located like masks; nobody says how large their pixels are."""
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running import photographs, queries
 from roadgeo.running.options import ReadOptions
+from roadgeo.running.photographs import _how_much_finer
 from roadgeo.running.queries import locate_query
 from roadgeo.sources.bands import PROBABILITY_TAG
 from roadgeo.sources.segmentation.probability import ProbabilityMap
@@ -63,6 +65,23 @@ def offset(document: dict, size: int = 1) -> float:
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
 
 
+def test_plugins_alone_have_no_more_ways_however_large_the_photograph(
+    photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+
+    def note(looks, *_):  # type: ignore[no-untyped-def]
+        taken.extend(look.note for look in looks)
+        raise MaskError("that is all")
+
+    monkeypatch.setattr(photographs, "locate_looks", note)
+    monkeypatch.setattr(photographs, "_MANY_PIXELS", 1)
+    monkeypatch.setattr(photographs, "call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
+    locate_query(str(photo), [], reading=ReadOptions(segment="always", segmenters=("one", "another")))
+    assert taken
+    assert not any("ways" in item for item in taken)
+
+
 @pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
 def test_the_second_look_shows_the_photograph_more_ways(
     segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch
@@ -94,6 +113,56 @@ def test_the_second_look_shows_the_photograph_more_ways(
         return
     assert (len(taken) > 1 and taken[1].endswith("shown 2 ways")) == ways
     assert not any("ways" in item for item in taken[:1] + taken[2:])
+
+
+@pytest.mark.parametrize(("ways", "expected"), [(1, [(0.5, 1)]), (2, [(1.0, 1), (0.5, 1)])])
+def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch, ways: int, expected: list[tuple[float, int]]
+) -> None:
+    props = {"class_names": {0: "ground", 1: "road"}, "ways": ways}
+    model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
+    shown: list[tuple[float, int]] = []
+
+    def note(
+        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
+    ) -> ProbabilityMap:
+        shown.append((round(scale, 1), ways))
+        return ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+
+    monkeypatch.setattr(photographs, "segment", note)
+    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenters=(str(model),)))
+    assert shown == expected
+
+
+def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    props = {"class_names": {0: "ground", 1: "road"}, "ways": 2}
+    model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
+    shown: list[tuple[float, int]] = []
+    taken: list[str] = []
+    nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+
+    def note(
+        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
+    ) -> ProbabilityMap:
+        shown.append((round(scale, 1), ways))
+        return nothing
+
+    def take(looks, see, *_):  # type: ignore[no-untyped-def]
+        for look in looks:
+            taken.append(f"{look.rank}{look.note}")
+            with suppress(MaskError):
+                see(look)
+        raise MaskError("that is all")
+
+    monkeypatch.setattr(photographs, "segment", note)
+    monkeypatch.setattr(photographs, "locate_looks", take)
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
+    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenters=(str(model),)))
+    assert taken[:4] == ["0", "0, shown 2 ways", "1", "2"]
+    # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
+    assert shown == [(1.0, 1), (1.0, 2), (2.0, 2)]
 
 
 def test_a_photograph_is_located(
@@ -147,6 +216,22 @@ def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
     assert coarse["gsd_m"] == pytest.approx(2 * fine["gsd_m"], rel=0.02)
     with rasterio.open(tmp_path / "coarse_mask.tif") as kept:
         assert kept.shape == (height, width)
+
+
+@pytest.mark.parametrize(
+    ("own", "scale", "expected"),
+    [
+        ((750, 750), 2.0, 2.0),
+        ((750, 750), 1.6, 1.6),
+        ((750, 750), 4.0, 2.0),  # no finer than that: a model sees nothing there
+        ((750, 750), 1.1, 1.0),  # hardly finer
+        ((3000, 3000), 0.5, 1.0),  # never coarser
+        ((5000, 6400), 2.0, 2.0**0.5),  # memory is bounded
+        ((8000, 8000), 2.0, 1.0),
+    ],
+)
+def test_how_much_finer(own: tuple[int, int], scale: float, expected: float) -> None:
+    assert _how_much_finer(own, scale) == pytest.approx(expected)
 
 
 def test_what_was_seen_is_told_and_drawn(
