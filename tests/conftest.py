@@ -20,15 +20,21 @@ settings.load_profile("steady")
 
 
 #: Folders whose tests start programs, draw masks or run whole commands: they take most of the time.
-SLOW = ("accept", "cli", "docs", "evaluation", "examples", "flights", "outputs", "qgis", "running", "workflows")
+SLOW = ("accept", "cli", "docs", "evaluation", "examples", "flights", "outputs", "qgis", "running", "serving")
+SLOW += ("workflows",)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow by its folder, and what reads real data, so that no new test there is forgotten."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what is slow by its folder, and what reads real data, so that no new test there is forgotten.
+
+    Where several processes share the tests, slow ones come first: none is to wait for another's long file in the end.
+    """
     here = Path(__file__).parent
     for item in items:
         if item.path.relative_to(here).parts[0] in SLOW or item.get_closest_marker("realdata"):
             item.add_marker(pytest.mark.slow)
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture(scope="session")

@@ -91,10 +91,8 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_an_onboard_computer_locates_and_names_what_is_missing(tmp_path: Path) -> None:
+def test_an_onboard_computer_locates_and_names_what_is_missing(porto: Path, tmp_path: Path) -> None:
     """A reference that was built elsewhere is all it needs."""
-    reference = tmp_path / "porto.gpkg"
-    roadgeo.build_reference(ROADS, path=reference)
     drone = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -102,16 +100,16 @@ def test_an_onboard_computer_locates_and_names_what_is_missing(tmp_path: Path) -
         return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
 
     for arguments in (
-        ["locate", drone, "-r", reference, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
-        ["locate", drone, "-r", reference, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
+        ["locate", drone, "-r", porto, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
+        ["locate", drone, "-r", porto, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
         ["vectorize", drone],
-        ["info", reference],
+        ["info", porto],
     ):
         done = run(*arguments)
         assert done.returncode == 0, done.stderr
     for package, arguments in (
         ("shapely", ["index", "--roads", ROADS, "--out", "a.gpkg"]),
-        ("uvicorn", ["serve", "-r", reference]),
+        ("uvicorn", ["serve", "-r", porto]),
     ):
         done = run(*arguments)
         assert done.returncode == 1

@@ -161,10 +161,10 @@ def test_the_command_line_knows_what_is_installed(
     ],
 )
 def test_what_is_of_the_wrong_kind_is_refused(
-    offer, kind: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], demo_reference: Path
+    offer, kind: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], porto: Path
 ) -> None:
     offer(**{f"{kind}_odd": f"{__name__}:give_nothing"})
-    locate = ["locate", str(SHEET), "-r", str(demo_reference), "-o", str(tmp_path)]
+    locate = ["locate", str(SHEET), "-r", str(porto), "-o", str(tmp_path)]
     arguments = {
         "sources": ["index", "--source", "odd:there", "--out", str(tmp_path / "odd.gpkg")],
         "outputs": [*locate, "--also", "odd"],
@@ -172,13 +172,6 @@ def test_what_is_of_the_wrong_kind_is_refused(
     }
     assert main(arguments[kind]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
-
-
-@pytest.fixture(scope="module")
-def demo_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    assert main(["index", "--source", f"files:{ROADS}", "--out", str(path), "--quiet"]) == 0
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@
 """
 
 import json
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ DATA = Path(__file__).parents[1] / "data" / "accept"
 CASES = json.loads((DATA / "cases.json").read_text(encoding="utf-8"))
 
 
-@lru_cache(maxsize=2)
+@cache
 def reference_of(city):
     return roadgeo.build_reference(DATA / f"{city}.parquet")
 
@@ -54,7 +54,7 @@ def test_what_has_a_place_is_located(case):
     assert off[1:].max() < 60.0
 
 
-@lru_cache
+@cache
 def crs_of(city):
     import geopandas as gpd
 

@@ -70,21 +70,6 @@ def test_the_error_rates_that_results_state_are_those_counted(trust):
     assert ERROR_RATES[0].score == LocateOptions().min_log10_odds
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize(("city", "seed", "k"), [("astana", 14, 2), ("portland", 61, 5)])
-def test_what_is_like_its_mirror_image_is_not_located_turned_over(trust, data_dir, tmp_path, city, seed, k):
-    """A motorway junction lay on another at 10^4.2, a grid of streets on its own place at 10^4.7: both roughly."""
-    import geopandas as gpd
-
-    roads = gpd.read_parquet(data_dir / "atlas" / "roads_packed_plane.parquet")
-    roads[roads.city == city].to_parquet(tmp_path / f"{city}.parquet")
-    known = trust.open_city(tmp_path / f"{city}.parquet", tmp_path)
-    _, mask = trust.Searched(known, known, "mirrored", seed, k + 1).open()(k)
-    answer = trust.ReferenceLocator((known.reference,), LocateOptions(effort="quick")).open()(mask)
-    assert answer["status"] == "not_located"
-    assert answer["log10_odds"] < 3.2
-
-
 def test_rows_come_back_from_their_file(trust, tmp_path):
     rows = [
         trust.Row("porto", 1, "there", "mild", 20.25, np.inf, True, 0.5),

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.outputs.names import bare_command, bare_name, bare_names, table_cell, without_folders
 from roadgeo.outputs.registry import ALSO
 
@@ -63,7 +63,9 @@ def test_a_command_without_folders() -> None:
     assert bare_command("roadgeo '/home/me") == "roadgeo 'me"
 
 
-def test_no_file_shows_the_folders_of_whoever_made_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_file_shows_the_folders_of_whoever_made_it(
+    porto: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Paths as they were typed stand in the JSON beside the others alone."""
     (tmp_path / "shown").mkdir()
     monkeypatch.chdir(tmp_path / "shown")
@@ -71,7 +73,8 @@ def test_no_file_shows_the_folders_of_whoever_made_it(tmp_path: Path, monkeypatc
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "drone.png").write_bytes(DRONE.read_bytes())
     (tmp_path / "b" / "empty.png").touch()
-    assert main(["index", "--roads", str(ROADS), "--out", str(tmp_path / "porto.gpkg"), "-q"]) == 0
+    for part in (porto, porto.with_suffix(".index")):
+        (tmp_path / part.name).write_bytes(part.read_bytes())
     masks = [str(tmp_path / name) for name in ("a/drone.png", "b/drone.png", "b/empty.png")]
     also = [word for name in ALSO for word in ("--also", name)]
     more = ["--plot", "--report", "--explain", *also]

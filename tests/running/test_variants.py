@@ -5,18 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.homography import Homography
+from roadgeo.reference.reference import open_reference
 from roadgeo.running.variants import in_pixels_of, mirrored, resampled
 from roadgeo.sources.masks import read_mask
-from roadgeo.workflows import build_reference, locate
+from roadgeo.workflows import locate
 
 MASK = next(mask for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")
-def located():
-    location = locate(read_mask(MASK.path), [build_reference(str(ROADS), "porto")])
+def located(porto):
+    location = locate(read_mask(MASK.path), [open_reference(porto)])
     assert location.located
     return location
 

@@ -64,5 +64,4 @@ def test_photographs_too(porto: Path, tmp_path: Path) -> None:
     left, right, again = (once[str(path)] for path in photos)
     assert left == {**again, "query": left["query"]} != {**right, "query": left["query"]}
     assert left["n_intersections"] > 10
-    assert answers(porto, tmp_path / "b", photos[::-1], *hints, threads=3) == once
-    assert answers(porto, tmp_path / "c", photos, *hints, "--jobs", "2") == once
+    assert answers(porto, tmp_path / "b", photos[::-1], *hints, "--jobs", "2", threads=3) == once

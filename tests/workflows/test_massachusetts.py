@@ -18,7 +18,7 @@ from roadgeo.workflows import build_reference, locate
 
 pytestmark = pytest.mark.realdata
 
-VIEWS = 4  # of each mask that lies on the map; of the others one
+VIEWS = 2  # of each mask that lies on the map; of the others one
 
 
 @pytest.fixture(scope="module")

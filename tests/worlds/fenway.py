@@ -21,6 +21,7 @@ def elements():
     return {e["id"]: e for e in found if e["type"] == "node"}, [e for e in found if e["type"] == "way"]
 
 
+@lru_cache
 def streets():
     """(L,) LineStrings in degrees, and their `highway` and `tunnel`."""
     nodes, ways = elements()

@@ -1,6 +1,7 @@
 """The streets of Fenway as OpenStreetMap files of every shape that programs write."""
 
 import json
+from functools import cache
 
 from worlds.fenway import elements
 
@@ -30,6 +31,7 @@ def _negative():
     )
 
 
+@cache
 def osm_texts():
     """Texts of files by what is odd about them, all with the same streets."""
     nodes, ways = elements()
