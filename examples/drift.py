@@ -12,9 +12,9 @@ import argparse
 import math
 
 import numpy as np
+from simulated_flights import FlightOptions, _draw_views, _motion
 
 from roadgeo._arrays import FloatArray
-from roadgeo.evaluation.flights import FlightOptions, _draw_views, _motion
 from roadgeo.flights.pose import Pose, predict, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.pinhole import View

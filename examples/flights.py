@@ -17,9 +17,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from simulated_flights import Flight, FlightOptions, simulate_flight
 
 from roadgeo._arrays import FloatArray
-from roadgeo.evaluation.flights import Flight, FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.motion import Odometer
 from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from simulated_flights import FlightOptions, simulate_flight
 
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.strips import place_strips
 from roadgeo.flights.tracker import FlightFrame

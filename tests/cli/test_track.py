@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from support.mavlink_peer import listening, of_kind
 
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.cli import main
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.flights.motion import write_motion

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
 from roadgeo.flights.mosaic import lay_together

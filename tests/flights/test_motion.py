@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.errors import RoadSourceError
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.motion import (
     Odometer,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from roadgeo.evaluation.flights import FlightOptions, _draw_views, _motion
+from examples.simulated_flights import FlightOptions, _draw_views, _motion
 from roadgeo.flights.pose import _Local, _skews, predict, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.pinhole import make_view

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.motion import TracedMask, overlay
 from roadgeo.flights.strips import Link, adjust, find_nets, place_strips

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import fix_of
 from roadgeo.flights.pose import start

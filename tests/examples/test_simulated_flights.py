@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from worlds.towns import lattice_town
 
+from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.errors import RoadSourceError
-from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.geometry.homography import Homography
 
 TOWN = lattice_town(20)
