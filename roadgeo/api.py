@@ -87,10 +87,9 @@ class Answer(Location):
         from roadgeo.outputs.location_files import OutputOptions, write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.running.pictures import as_file
-        from roadgeo.storage.files import writing
+        from roadgeo.storage.files import make_folder
 
-        with writing(out_dir):
-            Path(out_dir).mkdir(parents=True, exist_ok=True)
+        make_folder(out_dir)
         paths = output_paths(out_dir, stem or Path(self.query).stem or "mask")
         options = OutputOptions(products=tuple(also))
         photo = self.photo if self.pixels is None else self.pixels

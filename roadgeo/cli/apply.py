@@ -7,10 +7,10 @@ from typing import Any
 import click
 
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import OTHERS, Command, Plugin, each, out_dir_option, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import offered
+from roadgeo.storage.files import make_folder
 
 __all__ = ["apply_command"]
 

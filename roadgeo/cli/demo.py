@@ -38,14 +38,13 @@ def demo_command(out_dir: str) -> int:
       roadgeo demo --out-dir porto
     """
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.folders import make_folder
     from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.registry import OVERLAY
     from roadgeo.running.batch import locate_masks
     from roadgeo.running.options import BatchOptions
     from roadgeo.running.tasks import Task
-    from roadgeo.storage.files import write_bytes
+    from roadgeo.storage.files import make_folder, write_bytes
     from roadgeo.workflows import build_reference
 
     # the sources of the demonstration are left beside its results

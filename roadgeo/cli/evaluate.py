@@ -94,13 +94,12 @@ def evaluate_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.trials import ReferenceLocator
     from roadgeo.reference.library import resolve_whole
-    from roadgeo.storage.files import writing
+    from roadgeo.storage.files import make_folder
 
     _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
     path = resolve_whole(reference)
     if out_dir is not None:
-        with writing(out_dir):
-            out_dir.mkdir(parents=True, exist_ok=True)
+        make_folder(out_dir)
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     compile_once(quiet)

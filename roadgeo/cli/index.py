@@ -97,10 +97,10 @@ def index_command(
     result is a folder, REF.shards, and is searched as one map. The same command goes on with a build cut short.
     """
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.folders import make_folder
     from roadgeo.cli.progress import show_steps
     from roadgeo.reference.library import make_slug, new_reference
     from roadgeo.reference.reference import COARSE
+    from roadgeo.storage.files import make_folder
     from roadgeo.workflows import build_reference
 
     started = perf_counter()

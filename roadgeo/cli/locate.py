@@ -16,7 +16,6 @@ from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.command_line import said_options
-from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import (
     ASPECT,
     IMAGE,
@@ -52,6 +51,7 @@ from roadgeo.outputs.wording import format_lonlat
 from roadgeo.running.batch import Outcome, locate_masks, open_references, write_overview
 from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import SUFFIXES, find_masks, name_tasks
+from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions

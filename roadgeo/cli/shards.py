@@ -74,11 +74,11 @@ def build_in_shards(
         The roads do not come from files, or `--out` names something else.
     """
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.folders import make_folder
     from roadgeo.cli.progress import show_steps
     from roadgeo.reference.library import make_slug, new_reference
     from roadgeo.reference.shards import ENDING
     from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
+    from roadgeo.storage.files import make_folder
 
     if not source["roads"]:
         raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")

@@ -40,16 +40,14 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     from roadgeo.evaluation.trials import read_landscape
     from roadgeo.evaluation.truth import write_truth
     from roadgeo.reference.library import resolve_whole
-    from roadgeo.storage.files import write_bytes, writing
+    from roadgeo.storage.files import make_folder, write_bytes
 
     sets = query_sets(options)
     landscape = read_landscape(resolve_whole(reference), roads)
     truths = []
     with count_up(sum(count for _, count in sets), quiet) as advance:
         for simulation, count in sets:
-            folder = out_dir / simulation.kind
-            with writing(folder):
-                folder.mkdir(parents=True, exist_ok=True)
+            make_folder(out_dir / simulation.kind)
             for k in range(count):
                 query = simulate_query(landscape, simulation, k)
                 write_bytes(out_dir / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())

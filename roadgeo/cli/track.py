@@ -15,7 +15,6 @@ import click
 
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import (
     RESULTS,
     Command,
@@ -30,6 +29,7 @@ from roadgeo.cli.options import (
     take,
 )
 from roadgeo.cli.printing import echo, paint
+from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
     from roadgeo.flights.frames import FrameOptions

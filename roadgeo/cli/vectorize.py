@@ -8,11 +8,11 @@ import click
 
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
-from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import Command, out_dir_option, read_options, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
+from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
     from roadgeo._progress import Say

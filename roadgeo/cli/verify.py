@@ -13,9 +13,9 @@ import click
 
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.folders import make_folder
 from roadgeo.cli.options import IMAGE, OTHERS, RESULTS, Command, each, out_dir_option, read_options, row, take
 from roadgeo.cli.printing import echo, paint, plain
+from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import math
 from collections.abc import Iterator, Sequence
 
@@ -17,7 +15,7 @@ from roadgeo.geometry.projection import transformer
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import Layer, Ring
 from roadgeo.outputs.drawing.views import Window, map_layer
-from roadgeo.outputs.names import table_cell
+from roadgeo.outputs.names import table_cell, table_text
 from roadgeo.outputs.report.page import footer, render_page, section
 from roadgeo.outputs.report.viewer import draw_viewer, window_data
 
@@ -104,16 +102,14 @@ def _outcome(entry: Score) -> str:
 def masks_to_csv(evaluation: Evaluation) -> str:
     """Return a table of all masks: what each is, how it fared, and why."""
     names = list(dict.fromkeys(name for entry in evaluation.scores for name in entry.properties))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
     own = ["file", "kind", "on_map", "status", "outcome", "center_m", "corners_rms_m", "log10_odds", "compute_s"]
-    table.writerow([*own, "reason", *names])
+    rows: list[list[object]] = [[*own, "reason", *names]]
     for entry in evaluation.scores:
         numbers = (entry.center_m, entry.corners_rms_m, entry.log10_odds, entry.compute_s)
         cells = [table_cell(entry.file), entry.kind, entry.on_map, entry.status, _outcome(entry)]
         cells += ["" if math.isnan(number) else f"{number:.6g}" for number in numbers]
-        table.writerow([*cells, table_cell(entry.reason), *(entry.properties.get(name, "") for name in names)])
-    return text.getvalue()
+        rows.append([*cells, table_cell(entry.reason), *(entry.properties.get(name, "") for name in names)])
+    return table_text(rows)
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.outputs.names import table_text
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
 
@@ -183,17 +184,15 @@ def _to_json(truths: Sequence[Truth], further: Mapping[str, Any]) -> str:
 
 def _to_csv(truths: Sequence[Truth]) -> str:
     names = list(dict.fromkeys(name for truth in truths for name in truth.properties))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*_OWN_COLUMNS, *names])
+    rows: list[list[object]] = [[*_OWN_COLUMNS, *names]]
     for truth in truths:
         record = truth_to_record(truth)
         # repr keeps every digit of a float, so that reading gives the same numbers.
         matrix = [repr(value) for row in record["homography"] for value in row]
-        table.writerow(
+        rows.append(
             [*(record[name] for name in _OWN_COLUMNS[:8]), *matrix, *(truth.properties.get(name, "") for name in names)]
         )
-    return text.getvalue()
+    return table_text(rows)
 
 
 def _from_row(row: dict[str, str], crs: str | None) -> Truth:

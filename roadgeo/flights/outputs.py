@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -15,7 +13,7 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo.flights.rows import Row
-from roadgeo.outputs.names import table_cell
+from roadgeo.outputs.names import table_cell, table_text
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
@@ -35,36 +33,21 @@ _COLUMNS = (
 
 def to_csv(rows: Sequence[Row]) -> str:
     """Return a table, one row a frame; columns that MISB ST 0601 knows have its names and units."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
     corners = [f"Corner {what} Point {k} (Full)" for k in range(1, 5) for what in ("Latitude", "Longitude")]
     first = ["Frame", "Name", "Time s", "Precision Time Stamp", "Status"]
     center = ["Frame Center Latitude", "Frame Center Longitude"]
     numbers = ["Target Error Estimate - CE90", "Sigma m", "Ground Sampling m", "Image Heading", "Log10 Odds"]
     sensor = ["Sensor Latitude", "Sensor Longitude", "Sensor Height Above Ground m", "Sensor Sigma m"]
-    table.writerow([*first, *center, *corners, *numbers, *sensor, "Known At Frame", "Reason"])
+    cells: list[list[object]] = [[*first, *center, *corners, *numbers, *sensor, "Known At Frame", "Reason"]]
     for row in rows:
         stamp = "" if row.time is None else str(round(row.time.timestamp() * 1e6))
         at = ["", ""] if row.center is None else [f"{row.center[1]:.8f}", f"{row.center[0]:.8f}"]
         ring = [""] * 8 if row.footprint is None else [f"{v:.8f}" for lon, lat in row.footprint for v in (lat, lon)]
         values = [_CE90 * row.sigma_m, row.sigma_m, row.gsd_m, row.heading_deg, row.log10_odds]
         measured = ["" if math.isnan(value) else f"{value:.4f}" for value in values]
-        table.writerow(
-            [
-                row.number,
-                table_cell(row.name),
-                f"{row.time_s:.3f}",
-                stamp,
-                row.status,
-                *at,
-                *ring,
-                *measured,
-                *_sensor(row),
-                row.known_at,
-                table_cell(row.reason),
-            ]
-        )
-    return text.getvalue()
+        head = [row.number, table_cell(row.name), f"{row.time_s:.3f}", stamp, row.status]
+        cells.append([*head, *at, *ring, *measured, *_sensor(row), row.known_at, table_cell(row.reason)])
+    return table_text(cells)
 
 
 def _sensor(row: Row) -> list[str]:

@@ -5,10 +5,10 @@ GDAL, QGIS and OpenDroneMap read pixels in their stored order, even if EXIF give
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,11 +16,19 @@ import numpy as np
 
 from roadgeo.errors import OutputError
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.outputs.names import name_for_odm
+from roadgeo.outputs.names import name_for_odm, table_text
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.crs import known_crs
 
-__all__ = ["write_gcps", "write_match_points", "write_matches", "write_odm", "write_points", "write_vrt"]
+__all__ = [
+    "georeferencer_points",
+    "write_gcps",
+    "write_match_points",
+    "write_matches",
+    "write_odm",
+    "write_points",
+    "write_vrt",
+]
 
 
 def write_gcps(path: Path, subject: Subject) -> None:
@@ -84,24 +92,31 @@ def _from_here(picture: Path, folder: Path) -> tuple[str, str]:
 
 def write_points(path: Path, subject: Subject) -> None:
     """Write control points for the QGIS Georeferencer, whose projective transformation reproduces the homography."""
-    wkt = known_crs(subject.place.crs).to_wkt()
-    lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
-    # QGIS places a picture without georeference below the x axis.
-    lines += [f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0" for column, row, x, y in subject.stored_control_points()]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.write_text(georeferencer_points(subject.place.crs, subject.stored_control_points()), encoding="utf-8")
+
+
+def georeferencer_points(crs: str, points: Iterable[Sequence[float]]) -> str:
+    """Return points as the QGIS Georeferencer reads them: column, row, x, y of each, and from where a fit has it.
+
+    That is by default nothing: dx, dy, their length, in pixels with y up.
+    """
+    lines = [f"#CRS: {known_crs(crs).to_wkt()}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    for column, row, x, y, *apart in points:
+        # QGIS places a picture without georeference below the x axis.
+        lines.append(",".join(map(repr, (x, y, column, -row, 1, *(apart or (0, 0, 0))))))
+    return "\n".join(lines) + "\n"
 
 
 def write_match_points(path: Path, subject: Subject) -> None:
     """Write the matched intersections as measured, for the QGIS Georeferencer; `write_points` writes exact points."""
-    wkt = known_crs(subject.place.crs).to_wkt()
-    lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    points = []
     for match in subject.matches():
         pixels = np.array([[match.column, match.row], [match.fitted_column, match.fitted_row]])
         (column, row), (fitted_column, fitted_row) = subject.stored(pixels).tolist()
         # QGIS's residuals are in pixels of the source, from the point to where the transformation has it.
         dx, dy = fitted_column - column, row - fitted_row
-        lines.append(f"{match.x!r},{match.y!r},{column!r},{-row!r},1,{dx!r},{dy!r},{math.hypot(dx, dy)!r}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        points.append((column, row, match.x, match.y, dx, dy, math.hypot(dx, dy)))
+    path.write_text(georeferencer_points(subject.place.crs, points), encoding="utf-8")
 
 
 def write_matches(path: Path, subject: Subject) -> None:
@@ -112,13 +127,12 @@ def write_matches(path: Path, subject: Subject) -> None:
     """
     matches = subject.matches()
     lonlat = to_lonlat(subject.place.crs, np.array([(match.x, match.y) for match in matches], float).reshape(-1, 2))
-    with path.open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(["id", "column", "row", "x", "y", "lon", "lat", "dx_m", "dy_m", "residual_m", "crs"])
-        for number, (match, (lon, lat)) in enumerate(zip(matches, lonlat.tolist(), strict=True), 1):
-            where = [match.column, match.row, match.x, match.y, f"{lon:.9f}", f"{lat:.9f}"]
-            apart = [match.dx_m, match.dy_m, float(np.hypot(match.dx_m, match.dy_m))]
-            table.writerow([number, *where, *apart, subject.place.crs])
+    rows: list[list[object]] = [["id", "column", "row", "x", "y", "lon", "lat", "dx_m", "dy_m", "residual_m", "crs"]]
+    for number, (match, (lon, lat)) in enumerate(zip(matches, lonlat.tolist(), strict=True), 1):
+        where = [match.column, match.row, match.x, match.y, f"{lon:.9f}", f"{lat:.9f}"]
+        apart = [match.dx_m, match.dy_m, math.hypot(match.dx_m, match.dy_m)]
+        rows.append([number, *where, *apart, subject.place.crs])
+    path.write_text(table_text(rows), encoding="utf-8", newline="")
 
 
 def write_odm(path: Path, subject: Subject) -> None:

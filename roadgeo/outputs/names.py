@@ -5,17 +5,19 @@ Paths as they were typed stand in `*_location.json` alone, and on the terminal.
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import os.path
 import re
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from roadgeo._text import visible
 
-__all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "table_cell", "without_folders"]
+__all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "table_cell", "table_text", "without_folders"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,6 +53,13 @@ def name_for_odm(name: str) -> str:
 def table_cell(text: str) -> str:
     """Return text for a cell of a table: behind an apostrophe where a spreadsheet would compute it as a formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
+def table_text(rows: Iterable[Iterable[object]]) -> str:
+    """Return rows of cells as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def without_folders(text: str, path: str = "") -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ import numpy as np
 from roadgeo.geometry.antimeridian import cut_ring
 from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
 from roadgeo.outputs.drawing.layers import rgb
-from roadgeo.outputs.names import bare_names, table_cell
+from roadgeo.outputs.names import bare_names, table_cell, table_text
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
 from roadgeo.storage.qml import draw_fill
@@ -67,9 +65,7 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
 
 
 def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*WORDS, "lon", "lat", "crs", "x", "y", *NUMBERS, "footprint_wkt"])
+    rows: list[list[Any]] = [[*WORDS, "lon", "lat", "crs", "x", "y", *NUMBERS, "footprint_wkt"]]
     for document in documents:
         here = document if document["status"] in _ON_MAP else {}
         center = here.get("center") or {}
@@ -77,8 +73,8 @@ def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
         values = {**attributes(document), "query": document["query"]}
         words, numbers = ([values[name] for name in names] for names in (WORDS, NUMBERS))
         words = [table_cell(str(word or "")) for word in words]
-        writer.writerow([*words, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
-    return text.getvalue()
+        rows.append([*words, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
+    return table_text(rows)
 
 
 def _to_wkt(corners: Sequence[Sequence[float]] | None) -> str:

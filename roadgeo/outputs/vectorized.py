@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.outputs.drawing import layers as drawn
 from roadgeo.outputs.drawing.layers import Color, Dots, Lines, Picture
@@ -17,7 +16,7 @@ from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.outputs.registry import VECTORIZED
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
-from roadgeo.storage.files import replacing
+from roadgeo.storage.files import make_folder, replacing
 from roadgeo.storage.geopackage import PIXELS, Layer, write_layers
 from roadgeo.storage.qml import draw_line, draw_marker
 
@@ -71,14 +70,8 @@ def write_vectorized(
     OutputError
         A file cannot be written.
     """
-    folder = Path(out_dir)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {folder}: {error.strerror}; choose one that you may write to"
-        ) from error
-    package, picture = (folder / f"{stem}{VECTORIZED}{suffix}" for suffix in (".gpkg", ".png"))
+    make_folder(out_dir)
+    package, picture = (Path(out_dir) / f"{stem}{VECTORIZED}{suffix}" for suffix in (".gpkg", ".png"))
     write_layers(package, _layers(graph, intersections, coarser))
     ground = None if photo is None else read_preview(photo, _MAX_SIDE)
     with replacing(picture) as temporary:

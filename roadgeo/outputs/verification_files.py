@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -13,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo.errors import OutputError
-from roadgeo.outputs.names import bare_names, table_cell, without_folders
-from roadgeo.storage.crs import known_crs
+from roadgeo.outputs.names import bare_names, table_cell, table_text, without_folders
 from roadgeo.storage.files import replacing, write_text
 from roadgeo.storage.orientation import read_orientation
 
@@ -31,14 +28,12 @@ _COLUMNS = (
 
 def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
     """Write one row for each image as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
+    rows: list[Sequence[Any]] = [_COLUMNS]
     names = bare_names([str(document["image"]) for document in documents])
     for document, image in zip(documents, names, strict=True):
         reason = without_folders(str(document.get("reason") or ""), str(document["image"]))
-        writer.writerow([_cell({**document, "image": image, "reason": reason}, name) for name in _COLUMNS])
-    write_text(path, text.getvalue())
+        rows.append([_cell({**document, "image": image, "reason": reason}, name) for name in _COLUMNS])
+    write_text(path, table_text(rows))
 
 
 def _cell(document: Mapping[str, Any], name: str) -> Any:
@@ -49,11 +44,9 @@ def _cell(document: Mapping[str, Any], name: str) -> Any:
 
 def write_points(path: Path, place: Georeference) -> None:
     """Write 25 control points of a corrected place, for the QGIS Georeferencer."""
-    rows = [f"#CRS: {known_crs(place.crs).to_wkt()}"]
-    rows.append("mapX,mapY,sourceX,sourceY,enable,dX,dY,residual")
-    for (column, row), (x, y) in zip(*(array.tolist() for array in place.control_points()), strict=True):
-        rows.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")
-    write_text(path, "\n".join(rows) + "\n")
+    from roadgeo.outputs.control_points import georeferencer_points
+
+    write_text(path, georeferencer_points(place.crs, np.hstack(place.control_points()).tolist()))
 
 
 def write_fixed(image: Path, path: Path, place: Georeference) -> None:

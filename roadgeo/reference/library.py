@@ -15,7 +15,7 @@ from roadgeo.reference.files import ReferencePaths, reference_paths
 from roadgeo.reference.network_file import not_a_reference
 from roadgeo.reference.remote import fetch_manifest, is_remote
 from roadgeo.reference.shards import ENDING, manifest_path
-from roadgeo.storage.files import writing
+from roadgeo.storage.files import make_folder, writing
 
 __all__ = [
     "library_dir",
@@ -58,8 +58,7 @@ def new_reference(name: str) -> Path:
         When the folder cannot be made.
     """
     folder = library_dir()
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return folder / f"{make_slug(name)}.gpkg"
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import IndexFormatError, how_to_install
-from roadgeo.storage.files import publish, staging, write_text, writing
+from roadgeo.storage.files import make_folder, publish, staging, write_text, writing
 from roadgeo.storage.folders import cache_dir
 
 __all__ = ["fetch_manifest", "fetch_shard", "is_remote"]
@@ -48,8 +48,7 @@ def fetch_manifest(url: str) -> Path:
     url = url.removesuffix(f"/{_MANIFEST}").rstrip("/")
     name = f"{blake2b(url.encode(), digest_size=8).hexdigest()}-{url.rpartition('/')[2]}"
     folder = _kept() / name
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     _fetch(f"{url}/{_MANIFEST}", folder / _MANIFEST, _MAX_MANIFEST)
     write_text(folder / _SOURCE, url)
     return folder

@@ -24,7 +24,7 @@ try:
 except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["publish", "replacing", "staging", "sync_file", "write_bytes", "write_text", "writing"]
+__all__ = ["make_folder", "publish", "replacing", "staging", "sync_file", "write_bytes", "write_text", "writing"]
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
@@ -38,6 +38,7 @@ _REMEDIES = {
     errno.EROFS: "choose a folder you may write to",
     errno.ENOENT: "create the folder first",
     errno.ENOTDIR: "choose a folder, not a file",
+    errno.EEXIST: "choose a folder, not a file",
     errno.EISDIR: "choose a file name, not a folder",
 }
 
@@ -51,6 +52,20 @@ def writing(target: str | os.PathLike[str]) -> Iterator[None]:
         remedy = _REMEDIES.get(error.errno or 0, "check the disk and the permissions")
         cause = error.strerror or str(error)
         raise OutputError(f"cannot write {os.fspath(target)}: {cause.lower()}; {remedy}") from error
+
+
+def make_folder(folder: str | os.PathLike[str]) -> None:
+    """Make a folder for results, unless it is there, and see that files can be put into it.
+
+    Raises
+    ------
+    OutputError
+        They cannot.
+    """
+    with writing(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "permission denied")
 
 
 @contextlib.contextmanager

@@ -75,5 +75,5 @@ def test_a_large_picture_takes_little_more_memory_than_itself() -> None:
 def test_a_folder_that_cannot_be_made(tmp_path: Path, mask: RoadMask) -> None:
     (tmp_path / "file").touch()
     graph = vectorize(mask).graph
-    with pytest.raises(OutputError, match="cannot make the folder"):
+    with pytest.raises(OutputError, match="choose a folder, not a file"):
         write_vectorized(tmp_path / "file", "a", mask, graph, find_intersections(graph))
