@@ -178,8 +178,9 @@ def to_plane(crs: str, plane: LocalPlane, xy: FloatArray) -> FloatArray:
 
 
 def transform(source: str, target: str, xy: FloatArray) -> FloatArray:
-    """Take (N, 2) coordinates of a CRS to another, which is no number where that has no such place."""
-    return np.stack(transformer(source, target).transform(*np.asarray(xy, float).T), axis=1)
+    """Take (..., 2) coordinates of a CRS to another, which is no number where that has no such place."""
+    xy = np.asarray(xy, float)
+    return np.stack(transformer(source, target).transform(xy[..., 0], xy[..., 1]), axis=-1)
 
 
 def metres_apart(a: FloatArray, b: FloatArray) -> float:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -98,7 +100,7 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
     name = Path(location.query).name or "mask"
     title = f"{name} on {story.reference}: {location.status.replace('_', ' ')}"
     write_text(picture, title, (_MARGIN, 42), 30, INK, bold=True)
-    write_text(picture, _shorten(location.reason, 150), (_MARGIN, 78), 21, FAINT)
+    write_text(picture, textwrap.shorten(location.reason, 150, placeholder="…"), (_MARGIN, 78), 21, FAINT)
     attribution = str(index.meta.get("attribution", ""))
     write_text(picture, attribution, (_WIDTH - right.shape[1] - _MARGIN, len(picture) - 12), 14, FAINT)
     return picture
@@ -198,7 +200,7 @@ def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, p
     write_text(panel, f"{number}   {odds}", (x, y + 24), 19, INK, bold=True)
     where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.camera.gsd_m:.2f} m/px"
     write_text(panel, where, (x, y + 48), 15, FAINT)
-    for i, line in enumerate(_wrap(place.why, side // 8)[:3]):
+    for i, line in enumerate(textwrap.wrap(place.why, side // 8)[:3]):
         write_text(panel, line, (x, y + 70 + 19 * i), 15, INK)
 
 
@@ -208,7 +210,8 @@ def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, p
 def _draw_notes(story: Story) -> AnyArray:
     """Write the stage that failed, and the meaning of the colours."""
     width = _WIDTH - _MASK - 3 * _MARGIN
-    lines = [line for note in story.missing for line in _bullet(note, width // 10)]
+    wrapped = partial(textwrap.wrap, width=width // 10, initial_indent="·  ", subsequent_indent="    ")
+    lines = [line for note in story.missing for line in wrapped(note)]
     panel = blank(114 + 27 * len(lines), width)
     y = 38
     if lines:
@@ -226,23 +229,3 @@ def _draw_notes(story: Story) -> AnyArray:
     ]
     draw_legend(panel, keys, 0, y + 18, 17)
     return panel
-
-
-def _bullet(note: str, width: int) -> list[str]:
-    """Wrap a note, later lines indented."""
-    first, *rest = _wrap(note, width)
-    return [f"·  {first}", *(f"    {line}" for line in rest)]
-
-
-def _wrap(text: str, width: int) -> list[str]:
-    """Break text into lines of at most `width` letters, at spaces."""
-    lines = [""]
-    for word in text.split():
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return lines
-
-
-def _shorten(text: str, length: int) -> str:
-    return text if len(text) <= length else f"{text[: length - 1].rstrip()}…"

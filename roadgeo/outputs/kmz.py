@@ -6,13 +6,13 @@ import html
 import zipfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from roadgeo.errors import OutputError
 from roadgeo.geometry.antimeridian import cut_ring, unwrap_ring
-from roadgeo.geometry.warping import MapGrid, cover, warp
+from roadgeo.geometry.warping import MapGrid
 from roadgeo.outputs.drawing.layers import rgb
+from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import mask_picture
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.subject import Subject
@@ -42,17 +42,11 @@ def _draw_in_degrees(subject: Subject) -> tuple[bytes, MapGrid]:
     """Draw the picture, or the mask's roads, in degrees around its own longitude: PNG and grid."""
     photo, place = subject.photo, subject.place
     image = mask_picture(subject.mask, rgb("query"), _SIDE) if photo is None else read_preview(photo, _SIDE)
-    size = image.shape[1], image.shape[0]
-    to_crs = subject.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
     middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
-    _, to_target, to_place = choose_target(place, ImageOptions(crs))
-    grid = cover(size, to_crs, None, _PIXELS, to_target)
-    warped = warp(image, to_crs, grid, to_place, cv2.INTER_LINEAR, place.lens(size))
-    encoded, content = cv2.imencode(".png", cv2.cvtColor(warped, cv2.COLOR_RGBA2BGRA))
-    if not encoded:
-        raise OutputError("OpenCV did not encode the picture of the KMZ; use a smaller one")
-    return content.tobytes(), grid
+    _, *ways = choose_target(place, ImageOptions(crs))
+    warped, grid = place.draw(image, subject.mask.shape[::-1], _PIXELS, ways)
+    return encode(warped, ".png"), grid
 
 
 _KML_POLYGON = """<Polygon><tessellate>1</tessellate>

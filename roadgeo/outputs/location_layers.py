@@ -83,16 +83,13 @@ def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
 def _corner_layer(place: Placement, location: Location) -> Layer:
     """Show the corners of the frame, each with the covariance of its position."""
     sigma, covariance = location.corner_sigma_m, location.corner_covariance_m2
-    unknown = np.full(4, np.nan)
-    blocks = np.full((4, 2, 2), np.nan)
-    if covariance is not None:
-        blocks = np.stack([covariance[i : i + 2, i : i + 2] for i in range(0, 8, 2)])
+    covariance = np.full((8, 8), np.nan) if covariance is None else covariance
     columns = {
         "corner": list(_CORNERS),
-        "sigma_m": unknown if sigma is None else sigma,
-        "var_x_m2": blocks[:, 0, 0],
-        "cov_xy_m2": blocks[:, 0, 1],
-        "var_y_m2": blocks[:, 1, 1],
+        "sigma_m": np.full(4, np.nan) if sigma is None else sigma,
+        "var_x_m2": covariance.diagonal()[::2],
+        "cov_xy_m2": covariance.diagonal(1)[::2],
+        "var_y_m2": covariance.diagonal()[1::2],
     }
     summary = "Corners of the frame; how far each may be off, and the covariance of its x and y"
     return Layer("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, summary)
@@ -103,11 +100,7 @@ def _alternative_layer(place: Placement, location: Location) -> Layer:
     others = location.alternatives
     values = np.array([(other.x, other.y, other.log10_odds, other.lon, other.lat) for other in others], float)
     values = values.reshape(-1, 5)
-    columns = {
-        "rank": np.arange(2, 2 + len(others)),
-        "log10_odds": values[:, 2],
-        "lon": values[:, 3],
-        "lat": values[:, 4],
-    }
+    columns = dict(zip(("log10_odds", "lon", "lat"), values.T[2:], strict=True))
+    columns = {"rank": np.arange(2, 2 + len(others)), **columns}
     text = "Middles of the best other places, with their odds"
     return Layer("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)

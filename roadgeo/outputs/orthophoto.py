@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
@@ -24,6 +24,7 @@ from rasterio.windows import Window
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
+from roadgeo.geometry.projection import transform
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
 from roadgeo.storage.crs import name_crs
@@ -164,17 +165,7 @@ def choose_target(place: Placement, options: ImageOptions) -> Target:
     crs = place.crs if options.crs is None else name_crs(options.crs)
     if crs == place.crs:
         return Target(crs, None, None)
-    from roadgeo.geometry.projection import transformer
-
-    there, back = (transformer(*pair) for pair in ((place.crs, crs), (crs, place.crs)))
-
-    def to_target(xy: FloatArray) -> FloatArray:
-        return np.stack(there.transform(xy[..., 0], xy[..., 1]), axis=-1)
-
-    def to_place(xy: FloatArray) -> FloatArray:
-        return np.stack(back.transform(xy[..., 0], xy[..., 1]), axis=-1)
-
-    return Target(crs, to_target, to_place)
+    return Target(crs, partial(transform, place.crs, crs), partial(transform, crs, place.crs))
 
 
 def warp_image(

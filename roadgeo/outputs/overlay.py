@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -30,40 +30,26 @@ from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat, write_sigma
 
-__all__ = ["PlotOptions", "draw_overlay", "write_overlay"]
+__all__ = ["MAP_PX", "MASK_SHARE", "draw_overlay", "write_overlay"]
 
 _GAP = 24  # pixels between the panels
 
 _LONGEST = 1.5  # ratio of the map's sides, so that captions fit and a long footprint still leaves room
 
 
-@dataclass(frozen=True)
-class PlotOptions:
-    """Size of the picture.
-
-    Attributes
-    ----------
-    map_px : int
-        Longer side of the map.
-    margin : float
-        Ground shown around the footprint, in lengths of its longer side.
-    mask_share : float
-        Width of the panel that shows photograph and mask as they came, as a share of `map_px`.
-    """
-
-    map_px: int = 1400
-    margin: float = 0.14
-    mask_share: float = 0.6
+#: Longer side of the map, pixels; the ground around the footprint, in lengths of its longer side; and the width of the
+#: panel that shows photograph and mask as they came, as a share of the map's side.
+MAP_PX, _MARGIN, MASK_SHARE = 1400, 0.14, 0.6
 
 
 def write_overlay(path: Path, subject: Subject) -> None:
     """Write `draw_overlay` as PNG."""
-    views = ViewOptions(picture_px=PlotOptions.map_px)
+    views = ViewOptions(picture_px=MAP_PX)
     shown = Shown.of(subject.location, subject.mask, subject.index, subject.photo, views, subject.attribution)
     write_png(path, draw_overlay(shown))
 
 
-def draw_overlay(subject: Shown, options: PlotOptions | None = None) -> AnyArray:
+def draw_overlay(subject: Shown, map_px: int = MAP_PX) -> AnyArray:
     """Draw a located mask on the map.
 
     Returns
@@ -76,18 +62,18 @@ def draw_overlay(subject: Shown, options: PlotOptions | None = None) -> AnyArray
     OutputError
         The location has no place.
     """
-    options, place = options or PlotOptions(), subject.placed()
+    place = subject.placed()
     # The map.
-    window = Window.around(place.footprint, options.margin).no_longer_than(_LONGEST)
-    canvas = Canvas.of(window.box, options.map_px, options.map_px)
+    window = Window.around(place.footprint, _MARGIN).no_longer_than(_LONGEST)
+    canvas = Canvas.of(window.box, map_px, map_px)
     layers = [layer for layer in place_layers(subject, place, window) if layer.name in STILL]
     canvas.draw(layers)
-    top = round(options.map_px * 0.075)
+    top = round(map_px * 0.075)
     draw_scale_bar(canvas, top // 4)
     _draw_north(canvas.image, top)
     # The frame beside it, title and legend around both.
     height, width = canvas.image.shape[:2]
-    left = blank(height, round(options.map_px * options.mask_share))
+    left = blank(height, round(map_px * MASK_SHARE))
     _draw_frames(left, subject)
     panels = np.hstack([left, blank(height, _GAP), canvas.image])
     picture = np.vstack([blank(top, panels.shape[1]), panels, blank(top // 2, panels.shape[1])])

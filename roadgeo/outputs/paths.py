@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.warping import MapGrid, Transform, cover, warp
 from roadgeo.location import Location
 from roadgeo.outputs.registry import FOOTPRINT, GEOPACKAGE, JSON, Output
 from roadgeo.roads.graph import RoadGraph
@@ -53,6 +56,24 @@ class Placement:
         """Take (..., 2) pixels of the mask (column, row; GDAL corner convention) to the CRS."""
         lens = self.lens(self.size)
         return Homography(self.homography)(pixels if lens is None else lens.straighten(pixels))
+
+    def draw(
+        self,
+        image: AnyArray,
+        size: tuple[int, int],
+        max_pixels: int,
+        ways: Sequence[Transform] = (None, None),
+        smooth: bool = True,
+    ) -> tuple[AnyArray, MapGrid]:
+        """Draw a picture of the frame, whose mask has `size` (width, height), on a grid of its own.
+
+        `ways` lead to the CRS of the grid, and back (see `orthophoto.Target`).
+        """
+        seen = image.shape[1], image.shape[0]
+        to_crs = self.homography @ np.diag([size[0] / seen[0], size[1] / seen[1], 1.0])
+        grid = cover(seen, to_crs, None, max_pixels, ways[0])
+        interpolation = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
+        return warp(image, to_crs, grid, ways[1], interpolation, self.lens(seen)), grid
 
     def map_roads(self, graph: RoadGraph) -> list[FloatArray]:
         """Lay the mask's roads (query plane) on the map: (V, 2) each, but for those that reach beyond the horizon.

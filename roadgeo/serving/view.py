@@ -14,13 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.geometry.warping import cover, warp
 from roadgeo.location import Location
+from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import Shown, ViewOptions
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.paths import Placement, output_paths
@@ -69,7 +69,8 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
         shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ViewOptions(picture_px=_SIDE), "")
     except MaskError:  # there is not a road in it
         shown = None
-    _write_picture(folder / PICTURE, read_preview(path, _SIDE)[..., :3])
+    picture = read_preview(path, _SIDE)[..., :3]
+    (folder / PICTURE).write_bytes(encode(picture, Path(PICTURE).suffix, cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
     view: dict[str, Any] = {"size": sighting.mask.shape[::-1], "roads": [], "place": None}
     view["is_photograph"] = sighting.of_photograph
     if shown is not None:
@@ -146,26 +147,15 @@ def _outline(size: tuple[int, int]) -> FloatArray:
 
 def _draw_on_map(path: Path, shown: Shown, place: Placement) -> list[list[float]] | None:
     """Draw the picture as web maps are drawn; return where its corners lie, from the top left; None where nowhere."""
+    _, *ways = choose_target(place, ImageOptions(crs=_WEB))
     image = shown.draw_picture(_MASK_COLOR)
-    size = image.shape[1], image.shape[0]
-    to_crs = place.homography @ np.diag([shown.size[0] / size[0], shown.size[1] / size[1], 1.0])
-    target = choose_target(place, ImageOptions(crs=_WEB))
-    grid = cover(size, to_crs, None, _MAP_SIDE**2, target.to_target)
+    warped, grid = place.draw(image, shown.size, _MAP_SIDE**2, ways, smooth=shown.photograph is not None)
     if grid.width == 0 or grid.width * grid.resolution > _WORLD_M / 4:
         return None
-    smooth = cv2.INTER_LINEAR if shown.photograph is not None else cv2.INTER_NEAREST
-    _write_picture(path, warp(image, to_crs, grid, target.to_place, smooth, place.lens(size)))
+    path.write_bytes(encode(warped, path.suffix, cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
     box = np.array([(0, 0), (grid.width, 0), (grid.width, grid.height), (0, grid.height)], float)
     corners: list[list[float]] = _rounded(to_lonlat(_WEB, Homography(grid.to_crs_matrix())(box)), 8)
     return corners
-
-
-def _write_picture(path: Path, image: AnyArray) -> None:
-    """Write (h, w, 3) or, with opacity, (h, w, 4) uint8 in the format of the path's suffix."""
-    turned = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    key = cv2.IMWRITE_WEBP_QUALITY if path.suffix == ".webp" else cv2.IMWRITE_JPEG_QUALITY
-    encoded = cv2.imencode(path.suffix, cv2.cvtColor(np.ascontiguousarray(image), turned), [key, _QUALITY])[1]
-    path.write_bytes(encoded.tobytes())
 
 
 def _rounded(values: FloatArray, digits: int) -> Any:

@@ -15,7 +15,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Location
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.views import Shown
-from roadgeo.outputs.overlay import PlotOptions, draw_overlay, write_overlay
+from roadgeo.outputs.overlay import MAP_PX, MASK_SHARE, draw_overlay, write_overlay
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.plot import draw_plot
 from roadgeo.outputs.subject import Subject
@@ -55,7 +55,7 @@ def shown(location: Location | None = None, mask: RoadMask | None = None, photo:
 def test_everything_is_drawn(truetype: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not truetype:
         monkeypatch.delattr(cv2, "FontFace", raising=False)
-    picture = draw_overlay(shown(), PlotOptions(map_px=600))
+    picture = draw_overlay(shown(), 600)
     assert picture.dtype == np.uint8
     for color in (FRAME, MATCH, QUERY_ROAD, MAP_ROAD):
         assert (picture == color).all(axis=2).sum() > 50
@@ -64,7 +64,7 @@ def test_everything_is_drawn(truetype: bool, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize("stretch", [(1.0, 1.0), (12.0, 1.0), (1.0, 12.0)])
 def test_a_long_footprint_still_makes_a_picture_of_bounded_size(stretch: tuple[float, float]) -> None:
     long = located(np.diag([*stretch, 1.0]) @ located().homography)
-    picture = draw_overlay(shown(long), PlotOptions(map_px=500))
+    picture = draw_overlay(shown(long), 500)
     assert max(picture.shape) < 1000
 
 
@@ -82,7 +82,7 @@ def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(sha
     without = draw_overlay(shown())
     assert with_it.shape == without.shape
     green = np.argwhere((with_it == (10, 200, 30)).all(axis=2))
-    width = 0.6 * PlotOptions.map_px
+    width = MASK_SHARE * MAP_PX
     assert len(green) > 0.02 * width**2
     assert green[:, 1].max() < 0.6 * width  # half of it is transparent
     assert green[:, 0].max() < 0.55 * len(with_it)  # above the mask
@@ -95,9 +95,8 @@ def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(sha
 def test_nothing_is_drawn_over_the_title_or_the_legend(shape: tuple[int, int], with_photo: bool) -> None:
     photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8) if with_photo else None
     mask = RoadMask(np.ones(shape, np.bool_))
-    options = PlotOptions()
-    picture = draw_overlay(shown(replace(located(), evidence=None), mask, photo), options)
-    top, panel = round(options.map_px * 0.075), round(options.map_px * options.mask_share)
+    picture = draw_overlay(shown(replace(located(), evidence=None), mask, photo))
+    top, panel = round(MAP_PX * 0.075), round(MAP_PX * MASK_SHARE)
     for strip in (picture[:top], picture[-(top // 2) :, :panel]):
         for color in (FRAME, (10, 200, 30)):
             assert not (strip == color).all(axis=2).any()

@@ -15,8 +15,8 @@ from roadgeo.errors import OutputError
 from roadgeo.outputs.drawing.layers import LOOKS, Box, Color, Dots, Layer, Lines, Look, Picture, Ring, rgb
 
 __all__ = [
-    "FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "draw_plate", "draw_scale_bar", "fixed_point",
-    "write_png", "write_text",
+    "FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "draw_plate", "draw_scale_bar", "encode",
+    "fixed_point", "write_png", "write_text",
 ]  # fmt: skip
 
 LIT, INK, FAINT = (255, 255, 255), rgb("ink"), rgb("faint")
@@ -186,14 +186,20 @@ def draw_plate(image: AnyArray, first: tuple[int, int], last: tuple[int, int]) -
 
 
 def write_png(path: Path, image: AnyArray) -> None:
-    """Write a picture (H, W, 3).
+    """Write a picture (H, W, 3) as `encode` does."""
+    path.write_bytes(encode(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 9))
+
+
+def encode(image: AnyArray, suffix: str, *settings: int) -> bytes:
+    """Return the file of a picture (H, W, 3), or with opacity (H, W, 4), in the format of a suffix.
 
     Raises
     ------
     OutputError
         It is too large for the format.
     """
-    done, encoded = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    turned = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    done, encoded = cv2.imencode(suffix, cv2.cvtColor(np.ascontiguousarray(image), turned), settings)
     if not done:
-        raise OutputError(f"cannot write {path}: OpenCV did not encode the picture; use a smaller one")
-    path.write_bytes(encoded.tobytes())
+        raise OutputError("OpenCV did not encode the picture; use a smaller one")
+    return encoded.tobytes()

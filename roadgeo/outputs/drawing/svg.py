@@ -27,6 +27,7 @@ from roadgeo.outputs.drawing.layers import (
     Picture,
     Ring,
 )
+from roadgeo.outputs.drawing.raster import encode
 
 __all__ = [
     "draw_dots", "draw_image", "draw_layer", "draw_lines", "draw_marks", "draw_sign", "encode_picture",
@@ -251,15 +252,12 @@ def encode_picture(image: AnyArray, limit: int, *, lossless: bool = False) -> st
     lossless : bool
         For drawings, which become smaller and sharper than when they are coded like photographs.
     """
-    options = [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS if lossless else _QUALITY]
-    picture = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGBA2BGRA)
-    encoded = cv2.imencode(".webp", picture, options)[1]
-    while len(encoded) > limit and min(picture.shape[:2]) > 1:
+    settings = cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS if lossless else _QUALITY
+    while len(encoded := encode(image, ".webp", *settings)) > limit and min(image.shape[:2]) > 1:
         factor = 0.9 * math.sqrt(limit / len(encoded))
-        size = [max(round(side * factor), 1) for side in picture.shape[1::-1]]
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        encoded = cv2.imencode(".webp", picture, options)[1]
-    return f"data:image/webp;base64,{base64.b64encode(encoded.tobytes()).decode()}"
+        size = [max(round(side * factor), 1) for side in image.shape[1::-1]]
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return f"data:image/webp;base64,{base64.b64encode(encoded).decode()}"
 
 
 def _straighten(line: FloatArray, tolerance: float) -> FloatArray:

@@ -11,7 +11,6 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
-from roadgeo.geometry.warping import cover, warp
 from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import trace_query
@@ -331,15 +330,10 @@ def map_layer(index: ReferenceIndex, window: Window, wide: Window, max_vertices:
 
 def _picture_on_map(subject: Shown, place: Placement, window: Window) -> list[Layer]:
     """Return the photograph, or the mask's roads, warped to where it lies; nothing where that cannot be drawn."""
-    image = subject.draw_picture(rgb("query"))
-    size = image.shape[1], image.shape[0]
-    to_crs = place.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
-    grid = cover(size, to_crs, None, subject.options.picture_px**2)
+    image, is_photograph = subject.draw_picture(rgb("query")), subject.photograph is not None
+    warped, grid = place.draw(image, subject.size, subject.options.picture_px**2, smooth=is_photograph)
     if grid.width == 0:
         return []
-    is_photograph = subject.photograph is not None
-    interpolation = cv2.INTER_LINEAR if is_photograph else cv2.INTER_NEAREST
-    warped = warp(image, to_crs, grid, interpolation=interpolation, lens=place.lens(size))
     x, y = window.place(np.array([grid.west, grid.north])).tolist()
     box = (x, y, grid.width * grid.resolution, grid.height * grid.resolution)
     picture = Picture(warped, box, subject.options.picture_bytes, lossless=not is_photograph)
