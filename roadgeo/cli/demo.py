@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -82,6 +82,9 @@ def demo_command(out_dir: str) -> int:
 
 def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
     """Compare with the truth; return whether it is right, and a sentence."""
+    from roadgeo.evaluation.scoring import score
+    from roadgeo.evaluation.truth import Truth
+
     found = outcome.document
     if outcome.status == "error":
         return False, str(found["reason"])
@@ -90,26 +93,11 @@ def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
         return right, f"{'refused, as it should be' if right else 'not found, although it is there'}: {found['reason']}"
     if not mask.in_map:
         return False, f"located, although it is not on this map: {found['reason']}"
-    center_m, corners_m = _errors(found, mask)
+    truth = Truth(mask.path.name, "mask", mask.homography, mask.crs, tuple(found["size"]))
+    scored = score(truth, found)
     where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
     seconds = found["seconds"]
-    return center_m < MAX_ERROR_M, (
-        f"found at {where}: the middle is {center_m:.1f} m off, the corners {corners_m:.1f} m; "
+    return scored.center_m < MAX_ERROR_M, (
+        f"found at {where}: the middle is {scored.center_m:.1f} m off, the corners {scored.corners_rms_m:.1f} m; "
         f"{found['n_matched']} intersections matched, {seconds['total'] - seconds['open'] - seconds['write']:.2f} s"
     )
-
-
-def _errors(found: dict[str, Any], mask: DemoMask) -> tuple[float, float]:
-    """Distance of the middle, and rms distance of the corners, between result and truth, metres."""
-    import numpy as np
-    import pyproj
-
-    from roadgeo.geometry.frame import Frame
-    from roadgeo.geometry.homography import Homography
-
-    frame = Frame(*found["size"])
-    pixels = np.vstack((frame.center, frame.corners))
-    x, y = Homography(mask.homography)(pixels).T
-    truth = np.stack(pyproj.Transformer.from_crs(mask.crs, found["crs"], always_xy=True).transform(x, y), axis=1)
-    distances = np.hypot(*(Homography(np.array(found["homography"]))(pixels) - truth).T)
-    return float(distances[0]), float(np.sqrt((distances[1:] ** 2).mean()))

@@ -217,11 +217,11 @@ def _evaluate(
 
 def _maps_of(locator: ReferenceLocator, truths: Sequence[Truth]) -> list[ReferenceIndex]:
     """Return the maps, or of a divided one the parts, that the masks lie on."""
-    from roadgeo.geometry.projection import transformer
+    from roadgeo.geometry.projection import to_lonlat
     from roadgeo.reference.reference import open_reference
 
     placed = [truth for truth in truths if truth.on_map and truth.crs is not None]
-    there = [transformer(str(truth.crs), "EPSG:4326").transform(*truth.center) for truth in placed]
+    there = [to_lonlat(str(truth.crs), truth.center).tolist() for truth in placed]
     return [index for path in locator.references for index in open_reference(path).indexes_at(there)]
 
 

@@ -48,12 +48,11 @@ def _is_file(given: str) -> bool:
 
 def _from_table(path: Path) -> tuple[tuple[str, float, float], ...]:
     from roadgeo.evaluation.truth import read_truth
-    from roadgeo.geometry.projection import transformer
+    from roadgeo.geometry.projection import to_lonlat
 
     truths = []
     for truth in read_truth(path):
         if truth.crs is None:
             raise click.UsageError(f"{path} has no CRS: add a column crs.")
-        lon, lat = transformer(truth.crs, "EPSG:4326").transform(*truth.center)
-        truths.append((truth.file, float(lon), float(lat)))
+        truths.append((truth.file, *to_lonlat(truth.crs, truth.center).tolist()))
     return tuple(truths)

@@ -8,10 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.scoring import Evaluation, Score, Share, Spread, Summary
 from roadgeo.evaluation.truth import Truth
-from roadgeo.geometry.projection import transformer
+from roadgeo.geometry.frame import Frame
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import Layer, Ring
 from roadgeo.outputs.drawing.views import Window, map_layer
@@ -175,7 +174,7 @@ def _draw_map(scores: Sequence[Score], truths: Sequence[Truth], indexes: Sequenc
     if not there:
         return ""
     crs = indexes[0].plane.crs if indexes else there[0][1].crs
-    rings = [_footprint(truth, crs) for _, truth in there]
+    rings = [truth.places(Frame(*truth.size).corners, crs) for _, truth in there]
     window = Window.around(np.concatenate(rings), _MARGIN)
     roads = [mark for index in indexes for mark in map_layer(index, window, window, _VERTICES).marks]
     layers = [Layer("map-roads", "roads of the map", roads)]
@@ -189,10 +188,3 @@ def _draw_map(scores: Sequence[Score], truths: Sequence[Truth], indexes: Sequenc
         layers.append(Layer(outcome, name, marks))
     data = window_data(window, _VIEW_PX)
     return draw_viewer("Where the masks lie", window.box, layers, data, scale=True, credit=credit)
-
-
-def _footprint(truth: Truth, crs: str | None) -> FloatArray:
-    """Return the footprint (4, 2) of a mask in a CRS."""
-    if truth.crs is None or crs is None or truth.crs == crs:
-        return truth.footprint
-    return np.column_stack(transformer(truth.crs, crs).transform(*truth.footprint.T))

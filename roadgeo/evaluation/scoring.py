@@ -14,11 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.truth import Truth
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import transformer
 
 __all__ = [
     "BREAKDOWNS",
@@ -116,7 +114,7 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
     frame = Frame(*(location.get("size") or truth.size))
     points = np.vstack((frame.center, frame.corners))
     found = Homography(np.array(location["homography"], float)).facing(frame.center)(points)
-    errors = np.hypot(*(found - _true_points(truth, points, location.get("crs"))).T)
+    errors = np.hypot(*(found - truth.places(points, location.get("crs"))).T)
     return replace(
         answered,
         right=answered.located and bool(errors[0] <= radius_m),
@@ -128,14 +126,6 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
 
 def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
-
-
-def _true_points(truth: Truth, pixels: FloatArray, crs: str | None) -> FloatArray:
-    """Where (K, 2) pixels really lie, in the CRS of the result."""
-    points = Homography(truth.homography).facing(pixels[0])(pixels)
-    if truth.crs is None or crs is None or truth.crs == crs:
-        return points
-    return np.column_stack(transformer(truth.crs, crs).transform(*points.T))
 
 
 # --- shares and spreads -----------------------------------------------------------------------------------------------

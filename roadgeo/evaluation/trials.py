@@ -15,7 +15,8 @@ from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.simulation import SimulationOptions, simulate_query, simulate_query_at
 from roadgeo.evaluation.truth import Truth, truth_from_record, truth_to_record
-from roadgeo.geometry.projection import transformer
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.projection import to_plane
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import open_reference
 from roadgeo.running.processes import run
@@ -82,12 +83,10 @@ def count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
     """Count masks whose place lies beyond the bounds of a reference, although their truth claims otherwise."""
     network = read_network(reference)
     low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
-    count = 0
-    for truth in truths:
-        center = transformer(truth.crs or network.plane.crs, network.plane.crs).transform(*truth.center)
-        xy = network.plane.from_crs(np.array([center], float))
-        count += truth.on_map and not ((xy >= low) & (xy <= high)).all()
-    return count
+    placed = [truth for truth in truths if truth.on_map]
+    centers = [truth.places(Frame(*truth.size).center, network.plane.crs) for truth in placed]
+    xy = network.plane.from_crs(np.reshape(centers, (-1, 2)))
+    return int((~((xy >= low) & (xy <= high)).all(axis=1)).sum())
 
 
 def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
@@ -104,9 +103,7 @@ def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
     from roadgeo.sources.roads import read_roads
 
     found = read_roads(roads)
-    there = transformer(network.plane.crs, found.plane.crs)
-    coverage = [network.plane.to_crs(ring) for ring in network.coverage]
-    rings = [found.plane.from_crs(np.column_stack(there.transform(*ring.T))) for ring in coverage]
+    rings = (to_plane(network.plane.crs, found.plane, network.plane.to_crs(ring)) for ring in network.coverage)
     return Landscape.from_lines(found.lines, found.plane, tuple(rings))
 
 

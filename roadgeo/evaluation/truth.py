@@ -35,6 +35,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import transform
 from roadgeo.outputs.names import table_text
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
@@ -79,12 +80,17 @@ class Truth:
     @property
     def footprint(self) -> FloatArray:
         """(4, 2) corners TL, TR, BR, BL in the CRS."""
-        return Homography(self.homography)(Frame(*self.size).corners)
+        return self.places(Frame(*self.size).corners)
 
     @property
     def center(self) -> FloatArray:
         """(2,) CRS position of the middle of the frame."""
-        return Homography(self.homography)(np.array(self.size) / 2)
+        return self.places(Frame(*self.size).center)
+
+    def places(self, pixels: FloatArray, crs: str | None = None) -> FloatArray:
+        """Return where (..., 2) pixels lie in a CRS, by default its own."""
+        own = Homography(self.homography).facing(Frame(*self.size).center)(pixels)
+        return own if self.crs is None or crs is None or self.crs == crs else transform(self.crs, crs, own)
 
 
 def write_truth(

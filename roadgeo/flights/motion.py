@@ -28,7 +28,7 @@ from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
+__all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion"]
 
 _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 
@@ -86,16 +86,6 @@ def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
         what = f"frame {bad[0]} has no homography" if bad else "it has no rows"
         raise RoadSourceError(f"{path} is no table of motions: {what}; expected 3 x 3 numbers that can be inverted")
     return found
-
-
-def write_motion(names: Sequence[str], motion: Sequence[FloatArray] | FloatArray) -> str:
-    """Return the text that `read_motion` reads."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", *_COLUMNS])
-    for name, matrix in zip(names, motion, strict=True):
-        table.writerow([name, *map(repr, np.asarray(matrix, float).ravel().tolist())])
-    return text.getvalue()
 
 
 # --- photographs ------------------------------------------------------------------------------------------------------

@@ -163,7 +163,7 @@ def _conformal_crs(points: FloatArray) -> str:
 
 
 def to_lonlat(crs: str, en: FloatArray) -> FloatArray:
-    """Take (N, 2) coordinates of a CRS to longitude and latitude (WGS 84), degrees."""
+    """Take (..., 2) coordinates of a CRS to longitude and latitude (WGS 84), degrees."""
     return transform(crs, "EPSG:4326", en)
 
 

@@ -33,7 +33,7 @@ from roadgeo.reference.network_file import (
 )
 from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import publish, staging, sync_file
+from roadgeo.storage.files import publish, replacing, staging, sync_file
 
 __all__ = [
     "Freshness",
@@ -185,12 +185,10 @@ def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], I
     before = identities(paths.geopackage)
     network = read_network(paths.geopackage)
     meta, arrays = build(network)
-    with staging(paths.index) as folder:
-        staged = folder / paths.index.name
+    with replacing(paths.index) as staged:
         dump_index(staged, meta, arrays, _about(network, meta))
         if identities(paths.geopackage) != before:
             raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
-        publish(staged, paths.index)
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:

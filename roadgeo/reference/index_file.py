@@ -44,7 +44,7 @@ from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import IndexFormatError, RoadgeoError
 from roadgeo.reference.plain_values import MAX_PICKLE, dump_plain, load_plain, require_plain
-from roadgeo.storage.files import publish, staging
+from roadgeo.storage.files import replacing
 
 __all__ = [
     "FORMAT_VERSION",
@@ -100,10 +100,8 @@ def write_index(
     TypeError
         When a value or array is of a kind that the format does not store.
     """
-    with staging(path) as folder:
-        staged = folder / Path(path).name
+    with replacing(path) as staged:
         dump_index(staged, meta, arrays, about)
-        publish(staged, path)
 
 
 def dump_index(

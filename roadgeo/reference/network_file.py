@@ -29,7 +29,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import publish, staging
+from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer, require_tables
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, name_features, seen_from, widen_by
 
@@ -122,10 +122,8 @@ def write_network(path: str | os.PathLike[str], network: RoadNetwork) -> None:
     CrsError
         When the plane's CRS is unknown.
     """
-    with staging(path) as folder:
-        staged = folder / Path(path).name
+    with replacing(path) as staged:
         dump_network(staged, network)
-        publish(staged, path)
 
 
 def dump_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> None:

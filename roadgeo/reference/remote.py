@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import IndexFormatError, how_to_install
-from roadgeo.storage.files import make_folder, publish, staging, write_text, writing
+from roadgeo.storage.files import make_folder, replacing, write_text, writing
 from roadgeo.storage.folders import cache_dir
 
 __all__ = ["fetch_manifest", "fetch_shard", "is_remote"]
@@ -93,11 +93,8 @@ def _fetch(url: str, target: Path, most: float) -> None:
 
         settings = {"client_kwargs": {"trace_configs": [_redirects()]}} if protocol.lower() in {"http", "https"} else {}
         files = fsspec.filesystem(protocol.lower(), **settings)
-    with staging(target) as folder:
-        with _reaching(url):
-            files.get_file(files._strip_protocol(url), str(folder / target.name), callback=_at_most(most))
-        with writing(target):
-            publish(folder / target.name, target)
+    with replacing(target) as staged, _reaching(url):
+        files.get_file(files._strip_protocol(url), str(staged), callback=_at_most(most))
 
 
 def _at_most(most: float) -> Any:

@@ -35,7 +35,7 @@ from roadgeo.reference.files import identities, reference_digest, reference_path
 from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
-from roadgeo.storage.files import publish, staging
+from roadgeo.storage.files import write_text
 
 __all__ = [
     "ENDING",
@@ -212,9 +212,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> Path:
         It cannot be written.
     """
     path = folder / _MANIFEST
-    with staging(path) as staged:
-        (staged / _MANIFEST).write_text(json.dumps(manifest.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
-        publish(staged / _MANIFEST, path)
+    write_text(path, json.dumps(manifest.to_dict(), indent=1, allow_nan=False))
     return path
 
 

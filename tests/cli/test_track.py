@@ -14,13 +14,13 @@ import cv2
 import jsonschema
 import numpy as np
 import pytest
+from flights.test_motion import write_motion
 from support.mavlink_peer import listening, of_kind
 
 from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.cli import main
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import has_pymavlink
-from roadgeo.flights.motion import write_motion
 from roadgeo.outputs.schemas import read_schema
 from roadgeo.reference.reference import Reference
 

@@ -15,7 +15,6 @@ from roadgeo.flights.motion import (
     between_images,
     between_masks,
     read_motion,
-    write_motion,
 )
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
@@ -117,6 +116,13 @@ def test_masks_without_roads_tell_nothing():
     blank = RoadMask(np.zeros((240, 320), bool))
     assert TracedMask.of(blank) is None
     assert Odometer().move(blank, RoadMask(streets() > 127))[0] is None
+
+
+def write_motion(names, motion):
+    """The table that `read_motion` reads."""
+    columns = ",".join(f"h{i}{j}" for i in range(3) for j in range(3))
+    rows = [",".join([name, *map(repr, np.ravel(matrix).tolist())]) for name, matrix in zip(names, motion, strict=True)]
+    return "\n".join([f"frame,{columns}", *rows])
 
 
 def test_a_file_is_read_as_it_was_written(tmp_path):
