@@ -26,7 +26,6 @@ __all__ = [
     "footprint_area",
     "simulate",
     "simulate_query",
-    "simulate_query_at",
 ]
 
 #: Draws of a view before a query is given up.
@@ -106,15 +105,25 @@ def simulate(landscape: Landscape, options: SimulationOptions, count: int) -> It
         yield simulate_query(landscape, options, k)
 
 
-def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> SimulatedQuery:
+def simulate_query(
+    landscape: Landscape, options: SimulationOptions, k: int, center: tuple[float, float] | None = None
+) -> SimulatedQuery:
     """Draw the k-th query of a set: always the same one for the same landscape and options.
+
+    The frame's middle lies at `center`, if that is given, however few intersections it shows.
 
     Raises
     ------
     RoadSourceError
         The map has no place for such a view.
     """
-    rng = _generator(options, k)
+    rng = np.random.default_rng([options.seed, zlib.crc32(options.kind.encode()), k])
+    if center is not None:
+        views = (_view_at(center, options.view, rng) for _ in range(MAX_TRIES))
+        view = next(filter(sees_ground, views), None)
+        if view is None:
+            raise RoadSourceError(_HORIZON)
+        return _draw_query(landscape, view, options, k, rng)
     least, most = options.view.intersections
     for _ in range(MAX_TRIES):
         query = _draw_query(landscape, draw_view(landscape, options.view, rng), options, k, rng)
@@ -123,24 +132,6 @@ def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> 
     raise RoadSourceError(
         f"no mask with {_range_text(least, most)} intersections left could be drawn; ask for fewer or for less noise"
     )
-
-
-def simulate_query_at(
-    landscape: Landscape, options: SimulationOptions, k: int, center: tuple[float, float]
-) -> SimulatedQuery:
-    """Draw a query whose frame's middle lies at a plane position, however few intersections it shows.
-
-    Raises
-    ------
-    RoadSourceError
-        Every view that the options allow holds the horizon.
-    """
-    rng = _generator(options, k)
-    for _ in range(MAX_TRIES):
-        view = _view_at(center, options.view, rng)
-        if sees_ground(view):
-            return _draw_query(landscape, view, options, k, rng)
-    raise RoadSourceError(_HORIZON)
 
 
 def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generator) -> View:
@@ -191,10 +182,6 @@ def footprint_area(options: ViewOptions, draws: int = 200) -> float:
     if not views:
         raise RoadSourceError(_HORIZON)
     return float(np.mean([polygon_area(view.footprint) for view in views]))
-
-
-def _generator(options: SimulationOptions, k: int) -> np.random.Generator:
-    return np.random.default_rng([options.seed, zlib.crc32(options.kind.encode()), k])
 
 
 def _view_at(center: tuple[float, float], options: ViewOptions, rng: np.random.Generator) -> View:

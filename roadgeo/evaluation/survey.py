@@ -23,7 +23,7 @@ from roadgeo.evaluation.localizability import (
 )
 from roadgeo.evaluation.scoring import score, share
 from roadgeo.evaluation.simulation import SimulationOptions, footprint_area
-from roadgeo.evaluation.trials import DrawnMasks, PlacedMasks, QuerySet, ReferenceLocator, Trial, run_trials
+from roadgeo.evaluation.trials import DrawnMasks, QuerySet, ReferenceLocator, Trial, run_trials
 from roadgeo.outputs.drawing.raster import write_png
 from roadgeo.outputs.registry import LOCALIZABILITY
 from roadgeo.reference.network_file import read_network
@@ -77,7 +77,8 @@ class Survey:
         rounds = (quarter, 0.5), (quarter, 0.85), (self.trials - 2 * quarter, 1.0)
         for number, (count, least) in enumerate(rounds, 1):
             centers = grid.draw(count, hope, rng)
-            masks = PlacedMasks(self.reference, self.simulation, tuple(map(tuple, centers.tolist())), len(places))
+            at: Any = tuple(map(tuple, centers.tolist()))
+            masks = DrawnMasks(self.reference, ((self.simulation, count),), centers=at, first=len(places))
             places = np.vstack([places, centers])
             located = np.concatenate([located, _located(self._try(masks, f"{number}"))])
             found = map_localizability(grid, places, located)

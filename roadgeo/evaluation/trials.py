@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.evaluation.simulation import SimulationOptions, simulate_query, simulate_query_at
+from roadgeo.evaluation.simulation import SimulationOptions, simulate_query
 from roadgeo.evaluation.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.projection import to_plane
@@ -28,7 +28,6 @@ __all__ = [
     "Locator",
     "Mask",
     "MaskFiles",
-    "PlacedMasks",
     "QuerySet",
     "ReferenceLocator",
     "Trial",
@@ -119,11 +118,17 @@ class DrawnMasks:
         Options and number of queries, set by set.
     roads : Path, optional
         Roads to draw instead of the reference's own.
+    centers : tuple of (float, float)
+        Middles of the frames, metres on the reference's plane; without them masks lie anywhere.
+    first : int
+        Number of the first query: others draw other noise.
     """
 
     geopackage: Path
     sets: tuple[tuple[SimulationOptions, int], ...]
     roads: Path | None = None
+    centers: tuple[tuple[float, float], ...] = ()
+    first: int = 0
 
     def __len__(self) -> int:
         """How many queries there are."""
@@ -135,39 +140,9 @@ class DrawnMasks:
         numbered = [(options, k) for options, count in self.sets for k in range(count)]
 
         def draw(k: int) -> tuple[Truth, Mask]:
-            query = simulate_query(landscape, *numbered[k])
-            return query.truth, query.mask
-
-        return draw
-
-
-@dataclass(frozen=True)
-class PlacedMasks:
-    """Masks drawn at given places of a reference.
-
-    Attributes
-    ----------
-    centers : tuple of (float, float)
-        Middles of the frames, metres on the reference's plane.
-    first : int
-        Number of the first query: others draw other noise.
-    """
-
-    geopackage: Path
-    options: SimulationOptions
-    centers: tuple[tuple[float, float], ...]
-    first: int = 0
-
-    def __len__(self) -> int:
-        """How many queries there are."""
-        return len(self.centers)
-
-    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
-        """Read the roads and return the function that draws the k-th query."""
-        landscape = read_landscape(self.geopackage)
-
-        def draw(k: int) -> tuple[Truth, Mask]:
-            query = simulate_query_at(landscape, self.options, self.first + k, self.centers[k])
+            options, number = numbered[k]
+            center = self.centers[number] if self.centers else None
+            query = simulate_query(landscape, options, self.first + number, center)
             return query.truth, query.mask
 
         return draw

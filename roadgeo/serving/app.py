@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from roadgeo.serving.page import page_file, page_text, policy_of
 from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.serving.view import OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
-from roadgeo.serving.workers import Answer, Asked, Place, Workers
+from roadgeo.serving.workers import Answer, Asked, Workers
 
 __all__ = ["Service"]
 
@@ -147,7 +147,7 @@ class Service:
         task.add_done_callback(self._tasks.discard)
         return JSONResponse(job.to_dict(), 201, {"Location": location, "Preference-Applied": "respond-async"})
 
-    async def _work(self, job: Job, place: Place, came: float) -> None:
+    async def _work(self, job: Job, place: ExitStack, came: float) -> None:
         with place:
             try:
                 answer = await self._ask(job, came, keeps=True)

@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -27,7 +27,7 @@ from starlette.exceptions import HTTPException
 from roadgeo._progress import Say, say_nothing
 from roadgeo.running.processes import end_with_parent, without_interrupts
 
-__all__ = ["Answer", "Asked", "Full", "Place", "Workers"]
+__all__ = ["Answer", "Asked", "Full", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -96,19 +96,6 @@ class CalledOff(Exception):  # noqa: N818 (a wish, not a fault)
     """Nobody waits for an answer any more."""
 
 
-class Place:
-    """The right of one request to wait for a process and to have it: a context manager that gives it back."""
-
-    def __init__(self, places: threading.Semaphore) -> None:
-        self._places = places
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        self._places.release()
-
-
 class Workers:
     """Processes, each with its references open, and a network for photographs that is loaded.
 
@@ -139,8 +126,8 @@ class Workers:
             self.close()
             raise
 
-    def take_place(self) -> Place:
-        """Take the place of one request, until its context ends.
+    def take_place(self) -> ExitStack:
+        """Take the right of one request to wait for a process and to have it, until its context ends.
 
         Raises
         ------
@@ -149,7 +136,9 @@ class Workers:
         """
         if not self._places.acquire(blocking=False):
             raise Full
-        return Place(self._places)
+        place = ExitStack()
+        place.callback(self._places.release)
+        return place
 
     def ask(self, asked: Asked, say: Say = say_nothing, called_off: threading.Event | None = None) -> Answer:
         """Have one process locate, as soon as one is free; who asks holds a place.

@@ -16,48 +16,35 @@ __all__ = [
 ]
 
 
-def draw_line(color: str, width_mm: float, casing: str = "", casing_width_mm: float = 0.0) -> str:
-    """Style a line layer; with a `casing`, over a wider line of that colour. Colours are "r,g,b" or "r,g,b,a"."""
-    layers = _layer("SimpleLine", _line_options(casing, casing_width_mm)) if casing else ""
-    return _vector("line", layers + _layer("SimpleLine", _line_options(color, width_mm)))
+def draw_line(color: str, width_mm: float) -> str:
+    """Style a line layer. Colours are "r,g,b" or "r,g,b,a"."""
+    line = {"line_color": color, "line_style": "solid", "line_width": width_mm, "line_width_unit": "MM"}
+    return _vector("line", _layer("SimpleLine", {**line, "capstyle": "round", "joinstyle": "round"}))
 
 
 def draw_arrow(color: str, width_mm: float) -> str:
     """Style a line layer with an arrow from the first vertex to the last."""
     head = '<symbol type="fill" name="@0@0" alpha="1">' + _layer("SimpleFill", {"color": color}) + "</symbol>"
-    options = {"arrow_width": f"{width_mm}", "arrow_start_width": f"{width_mm}", "is_curved": "0"}
-    sizes = {"head_length": "1.4", "head_thickness": "0.9", "head_type": "0", "arrow_type": "0"}
+    options = {"arrow_width": width_mm, "arrow_start_width": width_mm, "is_curved": 0}
+    sizes = {"head_length": 1.4, "head_thickness": 0.9, "head_type": 0, "arrow_type": 0}
     arrow = _layer("ArrowLine", {**options, **sizes}).replace("</layer>", f"{head}</layer>")
     return _vector("line", arrow)
 
 
 def draw_fill(color: str, outline: str, outline_width_mm: float) -> str:
     """Style a polygon layer: a fill (its alpha may be 0) and an outline."""
-    options = {
-        "color": color,
-        "style": "solid",
-        "outline_color": outline,
-        "outline_style": "solid",
-        "outline_width": f"{outline_width_mm}",
-        "outline_width_unit": "MM",
-        "joinstyle": "round",
-    }
+    options = {"color": color, "style": "solid", **_outline(outline, outline_width_mm), "joinstyle": "round"}
     return _vector("fill", _layer("SimpleFill", options))
 
 
-def draw_marker(color: str, size_mm: float, outline: str = "255,255,255", outline_width_mm: float = 0.2) -> str:
-    """Style a point layer with circles."""
-    options = {
-        "name": "circle",
-        "color": color,
-        "size": f"{size_mm}",
-        "size_unit": "MM",
-        "outline_color": outline,
-        "outline_style": "solid",
-        "outline_width": f"{outline_width_mm}",
-        "outline_width_unit": "MM",
-    }
+def draw_marker(color: str, size_mm: float) -> str:
+    """Style a point layer with circles, white around."""
+    options = {"name": "circle", "color": color, "size": size_mm, "size_unit": "MM", **_outline("255,255,255", 0.2)}
     return _vector("marker", _layer("SimpleMarker", options))
+
+
+def _outline(color: str, width_mm: float) -> dict[str, object]:
+    return {"outline_color": color, "outline_style": "solid", "outline_width": width_mm, "outline_width_unit": "MM"}
 
 
 def draw_palette(entries: Mapping[int, tuple[str, int, str]]) -> str:
@@ -110,18 +97,7 @@ def seen_from(style: str, scale: int) -> str:
     return style.replace("Symbology", "Symbology|Rendering").replace("<qgis ", f"<qgis {shown} ")
 
 
-def _line_options(color: str, width_mm: float) -> dict[str, str]:
-    return {
-        "line_color": color,
-        "line_style": "solid",
-        "line_width": f"{width_mm}",
-        "line_width_unit": "MM",
-        "capstyle": "round",
-        "joinstyle": "round",
-    }
-
-
-def _layer(kind: str, options: Mapping[str, str]) -> str:
+def _layer(kind: str, options: Mapping[str, object]) -> str:
     rows = "".join(f'<Option type="QString" name="{name}" value="{value}"/>' for name, value in options.items())
     return f'<layer class="{kind}" enabled="1" locked="0" pass="0"><Option type="Map">{rows}</Option></layer>'
 

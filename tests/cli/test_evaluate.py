@@ -119,7 +119,7 @@ def test_a_map_is_written_styled(town, tmp_path, capsys, monkeypatch):
     assert sum(entry["area_share"] for entry in summary["classes"]) == pytest.approx(1.0)
     assert "would be located" in capsys.readouterr().out
     pictures = [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")]
-    monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query_at", None)  # from the record
+    monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query", None)  # from the record
     monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query", None)
     assert run("evaluate", town, *options, "-j", 2, "-o", tmp_path) == 0
     assert [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")] == pictures

@@ -8,7 +8,7 @@ from worlds.towns import lattice_town
 
 from roadgeo.errors import RoadSourceError
 from roadgeo.evaluation.noise import NOISE_MODELS
-from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate, simulate_query, simulate_query_at
+from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate, simulate_query
 from roadgeo.geometry.homography import Homography
 
 TOWN = lattice_town()
@@ -61,10 +61,10 @@ def test_a_window_fixes_the_side_on_the_ground():
 
 def test_queries_can_be_placed():
     center = (330.0, 440.0)
-    query = simulate_query_at(TOWN, OPTIONS, 5, center)
+    query = simulate_query(TOWN, OPTIONS, 5, center)
     assert query.truth.center == pytest.approx(TOWN.plane.to_crs(np.array(center)))
-    assert np.array_equal(query.mask, simulate_query_at(TOWN, OPTIONS, 5, center).mask)
-    off_the_map = simulate_query_at(TOWN, replace(OPTIONS, noise=NOISE_MODELS["clean"]), 5, (1e5, 1e5))
+    assert np.array_equal(query.mask, simulate_query(TOWN, OPTIONS, 5, center).mask)
+    off_the_map = simulate_query(TOWN, replace(OPTIONS, noise=NOISE_MODELS["clean"]), 5, (1e5, 1e5))
     assert not off_the_map.mask.any()
 
 

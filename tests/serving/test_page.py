@@ -5,7 +5,7 @@ import json
 import os
 import re
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +25,6 @@ from roadgeo.reference.reference import Reference
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
 from roadgeo.serving.workers import Full, _answer
-from roadgeo.serving.workers import Place as Seat
 from roadgeo.workflows import locate
 
 VIEW = ViewOptions(size_px=(900, 900), gsd_m=(1.0, 1.0), heading_deg=(0.0, 360.0), intersections=(25, 1000))
@@ -47,7 +46,9 @@ class Direct:
     def take_place(self):
         if not self.places.acquire(blocking=False):
             raise Full
-        return Seat(self.places)
+        place = ExitStack()
+        place.callback(self.places.release)
+        return place
 
     def ask(self, asked, say=None, called_off=None):
         self.asked.append(asked)

@@ -25,7 +25,7 @@ from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Sighting
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import Answer, Full, Place, _answer
+from roadgeo.serving.workers import Answer, Full, _answer
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
@@ -46,7 +46,9 @@ class Workers:
     def take_place(self):
         if not self.places.acquire(blocking=False):
             raise Full
-        return Place(self.places)
+        place = ExitStack()
+        place.callback(self.places.release)
+        return place
 
     def ask(self, asked, say=None, called_off=None):
         if asked.keeps:
