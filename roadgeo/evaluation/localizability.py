@@ -20,7 +20,6 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.outputs.drawing.layers import Layer, Lines, Picture, rgb
 from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_scale_bar, write_text
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.qml import draw_palette
 
 __all__ = [
     "AMBIGUOUS",
@@ -29,13 +28,11 @@ __all__ = [
     "TOO_FEW",
     "UNKNOWN",
     "LocalizabilityMap",
-    "LocalizabilityOptions",
     "PlaceGrid",
     "draw_localizability",
     "lay_grid",
     "map_localizability",
     "to_geotiff",
-    "to_qml",
 ]
 
 UNKNOWN, LOCATED, AMBIGUOUS, TOO_FEW = 0, 1, 2, 3
@@ -53,33 +50,15 @@ _DIRECTIONS = 12
 #: Intersections with no other nearer than this are clear.
 CLEAR_M = 40.0
 
+#: Places are marked as located where, of the trials at places that promise as much or more, surely (at the lower end of
+#: the interval of so many standard errors) this share was located; and where they promise this probability themselves.
+_LOCATED_SHARE, _Z, _MIN_PROBABILITY = 0.95, 1.5, 0.95
+#: Places with fewer intersections around them hold too few, whatever the trials were: `locate` refuses such masks.
+_MIN_INTERSECTIONS = 6
+#: Cells along the side of a window; they are larger where the map would have more than so many along a side.
+_CELLS_PER_WINDOW, _MAX_CELLS = 10.0, 2000
 
-@dataclass(frozen=True)
-class LocalizabilityOptions:
-    """How surely, and how finely.
-
-    Attributes
-    ----------
-    located_share : float
-        Places are marked as located where, of the trials at places that promise as much or more, surely (at the lower
-        end of the interval of `z` standard errors) this share was located.
-    z : float
-    min_probability : float
-        Places that promise less are not marked as located, however well others do.
-    min_intersections : int
-        Places with fewer around them hold too few, whatever the trials were: `locate` refuses such masks.
-    cells_per_window : float
-        Cells along the side of a window.
-    max_cells : int
-        Cells are made larger where the map would have more along a side.
-    """
-
-    located_share: float = 0.95
-    z: float = 1.5
-    min_probability: float = 0.95
-    min_intersections: int = 6
-    cells_per_window: float = 10.0
-    max_cells: int = 2000
+_LONGER_PX = 1400  # side of the picture
 
 
 @dataclass(frozen=True)
@@ -145,21 +124,18 @@ class LocalizabilityMap:
         return found
 
 
-def lay_grid(network: RoadNetwork, footprint_m2: float, options: LocalizabilityOptions | None = None) -> PlaceGrid:
+def lay_grid(network: RoadNetwork, footprint_m2: float) -> PlaceGrid:
     """Describe every place of a map for masks of this area on the ground."""
-    options = options or LocalizabilityOptions()
     coords = network.graph.coords
     (west, south), (east, north) = coords.min(axis=0), coords.max(axis=0)
-    cell = max(math.sqrt(footprint_m2) / options.cells_per_window, max(east - west, north - south) / options.max_cells)
+    cell = max(math.sqrt(footprint_m2) / _CELLS_PER_WINDOW, max(east - west, north - south) / _MAX_CELLS)
     shape = math.ceil((north - south) / cell), math.ceil((east - west) / cell)
     counts, features = _features(network, west, north, cell, shape, math.sqrt(footprint_m2 / math.pi))
     covered = _covered(network, west, north, cell, shape)
     return PlaceGrid(network.plane, float(west), float(north), cell, footprint_m2, covered, counts, features)
 
 
-def map_localizability(
-    grid: PlaceGrid, places: FloatArray, located: BoolArray, options: LocalizabilityOptions | None = None
-) -> LocalizabilityMap:
+def map_localizability(grid: PlaceGrid, places: FloatArray, located: BoolArray) -> LocalizabilityMap:
     """Learn from trials where masks are located, and predict it for the whole map.
 
     Parameters
@@ -169,13 +145,14 @@ def map_localizability(
     located : (T,) bool
         Which of them were located.
     """
-    options = options or LocalizabilityOptions()
     shape = grid.counts.shape
     row, column = (np.clip(at, 0, n - 1) for at, n in zip(_cells(places, grid), shape, strict=True))
-    probability = _predict(grid.features, _fit(grid.features[row, column], located))
-    threshold = _threshold(probability[row, column], located, options)
-    none = grid.counts < options.min_intersections
-    few = none | (grid.counts < _fewest(grid.counts, probability))
+    intercept, *weights = _fit(grid.features[row, column], located)
+    probability = _logistic(grid.features @ weights + intercept)
+    threshold = _threshold(probability[row, column], located)
+    none = grid.counts < _MIN_INTERSECTIONS
+    # The least number of intersections with which any mask is rather located than not.
+    few = none | (grid.counts < grid.counts[probability >= 0.5].min(initial=np.inf))
     classes = np.where((probability >= threshold) & ~none, LOCATED, np.where(few, TOO_FEW, AMBIGUOUS))
     return LocalizabilityMap(
         grid,
@@ -262,27 +239,17 @@ def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.01) -> Float
     return np.concatenate(([weights[0] - (weights[1:] * mean / scale).sum()], weights[1:] / scale))
 
 
-def _predict(features: FloatArray, weights: FloatArray) -> FloatArray:
-    return _logistic(features @ weights[1:] + weights[0])
-
-
 def _logistic(x: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0))))
 
 
-def _threshold(probability: FloatArray, located: BoolArray, options: LocalizabilityOptions) -> float:
+def _threshold(probability: FloatArray, located: BoolArray) -> float:
     """Lowest probability above which the trials were surely located as often as asked."""
     order = np.argsort(-probability, kind="stable")
     hits = np.cumsum(located[order])
-    sure = [share(int(hits[k]), k + 1, options.z).low >= options.located_share for k in range(len(order))]
+    sure = [share(int(hits[k]), k + 1, _Z).low >= _LOCATED_SHARE for k in range(len(order))]
     last = np.flatnonzero(sure)
-    return max(float(probability[order[last[-1]]]), options.min_probability) if len(last) else math.inf
-
-
-def _fewest(counts: AnyArray, probability: FloatArray) -> float:
-    """Give the least number of intersections with which any mask is rather located than not."""
-    likely = counts[probability >= 0.5]
-    return float(likely.min()) if len(likely) else math.inf
+    return max(float(probability[order[last[-1]]]), _MIN_PROBABILITY) if len(last) else math.inf
 
 
 def _covered(network: RoadNetwork, west: float, north: float, cell: float, shape: tuple[int, int]) -> BoolArray:
@@ -304,21 +271,12 @@ def to_geotiff(found: LocalizabilityMap) -> bytes:
 
     grid = found.grid
     x, y = grid.plane.to_crs(np.array([grid.west, grid.north]))
-    profile = {
-        "driver": "GTiff",
-        "width": found.classes.shape[1],
-        "height": found.classes.shape[0],
-        "count": 2,
-        "dtype": "uint8",
-        "crs": grid.plane.crs,
-        "transform": rasterio.Affine(grid.cell_m, 0.0, x, 0.0, -grid.cell_m, y),
-        "compress": "deflate",
-        "interleave": "band",
-        "photometric": "minisblack",
-    }
+    height, width = found.classes.shape
+    place = {"crs": grid.plane.crs, "transform": rasterio.Affine(grid.cell_m, 0.0, x, 0.0, -grid.cell_m, y)}
+    kind = {"compress": "deflate", "interleave": "band", "photometric": "minisblack"}
     percent = np.where(np.isnan(found.probability), 255, np.nan_to_num(found.probability) * 100).round()
     with rasterio.MemoryFile() as memory:
-        with memory.open(**profile) as raster:
+        with memory.open(driver="GTiff", width=width, height=height, count=2, dtype="uint8", **place, **kind) as raster:
             raster.write(found.classes, 1)
             raster.write(percent.astype(np.uint8), 2)
             raster.set_band_description(
@@ -328,17 +286,12 @@ def to_geotiff(found: LocalizabilityMap) -> bytes:
         return bytes(memory.read())
 
 
-def to_qml() -> str:
-    """Style the GeoTIFF for QGIS: to be stored beside it under the same name."""
-    return draw_palette(PALETTE)
-
-
-def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str, longer_px: int = 1400) -> AnyArray:
+def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str) -> AnyArray:
     """Draw the map over its roads, with legend and scale: (height, width, 3) uint8, red, green, blue."""
     grid, colors = found.grid, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
     rows, columns = found.classes.shape
     box = (0.0, 0.0, columns * grid.cell_m, rows * grid.cell_m)
-    canvas = Canvas.of(box, longer_px, longer_px)
+    canvas = Canvas.of(box, _LONGER_PX, _LONGER_PX)
     lines = [(line - (grid.west, grid.north)) * (1.0, -1.0) for line in network.graph.polylines()]
     classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
     canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])

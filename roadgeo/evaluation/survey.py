@@ -19,7 +19,6 @@ from roadgeo.evaluation.localizability import (
     lay_grid,
     map_localizability,
     to_geotiff,
-    to_qml,
 )
 from roadgeo.evaluation.scoring import score, share
 from roadgeo.evaluation.simulation import SimulationOptions, footprint_area
@@ -29,6 +28,7 @@ from roadgeo.outputs.registry import LOCALIZABILITY
 from roadgeo.reference.network_file import read_network
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.files import replacing, write_bytes, write_text
+from roadgeo.storage.qml import draw_palette
 
 __all__ = ["ANY", "Survey", "write_survey"]
 
@@ -149,7 +149,7 @@ def write_survey(
     stem = f"{survey.reference.stem}{LOCALIZABILITY}"
     files = [out_dir / f"{stem}{suffix}" for suffix in (".tif", ".qml", ".png", ".json")]
     write_bytes(files[0], to_geotiff(found))
-    write_text(files[1], to_qml())
+    write_text(files[1], draw_palette(PALETTE))
     with replacing(files[2]) as temporary:
         write_png(temporary, draw_localizability(network, found, title))
     summary = {**survey.summarize(found), "settings": survey.settings, **(further or {})}

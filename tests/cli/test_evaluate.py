@@ -120,7 +120,6 @@ def test_a_map_is_written_styled(town, tmp_path, capsys, monkeypatch):
     assert "would be located" in capsys.readouterr().out
     pictures = [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")]
     monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query", None)  # from the record
-    monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query", None)
     assert run("evaluate", town, *options, "-j", 2, "-o", tmp_path) == 0
     assert [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")] == pictures
     assert figures(json.loads((tmp_path / "town_localizability.json").read_text())) == figures(summary)
