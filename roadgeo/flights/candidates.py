@@ -31,27 +31,13 @@ from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import Reference
 
-__all__ = ["CandidateOptions", "Candidates", "Look"]
+__all__ = ["Candidates", "Look"]
 
 
 #: Number of times that the places are compared at the scale of the best one, until it stays that.
 _MOST_SCALES = 4
-
-
-@dataclass(frozen=True)
-class CandidateOptions:
-    """How many places are kept.
-
-    Attributes
-    ----------
-    per_look : int
-        Best places of each look that are weighed again with the frames to come.
-    most : int
-        The places that explain most are kept, up to this number.
-    """
-
-    per_look: int = 30
-    most: int = 60
+#: Best places of each look that are weighed again with the frames to come; of all, those that explain most are kept.
+PER_LOOK, MOST = 30, 60
 
 
 @dataclass(frozen=True)
@@ -125,7 +111,6 @@ class Candidates:
     """
 
     references: Sequence[Reference]
-    options: CandidateOptions = field(default_factory=CandidateOptions)
     n_looks: int = 0
     _kept: list[_Candidate] = field(default_factory=list)
 
@@ -153,7 +138,7 @@ class Candidates:
         for result in found:
             self._take(result, look, options)
         self._kept = [place for place in self._kept if place.fit is not None]
-        self._kept = sorted(self._kept, key=_likelihood, reverse=True)[: self.options.most]
+        self._kept = sorted(self._kept, key=_likelihood, reverse=True)[:MOST]
         return decide(look.query, self._judged(found, look, options), options)
 
     def _judged(self, found: Sequence[Found], look: Look, options: LocateOptions) -> list[Found]:
@@ -208,7 +193,7 @@ class Candidates:
             return
         best: list[Hypothesis] = []
         for model in sorted(estimator.verified, key=lambda model: -model.log10_likelihood):
-            if len(best) < self.options.per_look and not any(estimator.same(model, known) for known in best):
+            if len(best) < PER_LOOK and not any(estimator.same(model, known) for known in best):
                 best.append(model)
         for model in best:
             here = (place for place in self._kept if place.whole is found.index)

@@ -17,33 +17,18 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 
-__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_down", "lay_together", "level"]
+__all__ = ["Mosaic", "chain", "lay_down", "lay_together", "level"]
 
 
-@dataclass(frozen=True)
-class MosaicOptions:
-    """How frames are laid together.
-
-    Attributes
-    ----------
-    road_px : float
-        Roads are drawn about so wide, so that large frames do not make a larger mosaic than tracing needs.
-    max_pixels : int
-        A larger mosaic is drawn coarser.
-    share : float
-        A pixel is road where more than this share of the frames that see it show one: roads are missed more often
-        than they are invented.
-    height_sigma : float
-        How much the height over the ground varies during a flight, as a share of it.
-    tilt_sigma : float
-        Tangent of a usual tilt of the camera.
-    """
-
-    road_px: float = 9.0
-    max_pixels: int = 16_000_000
-    share: float = 0.34
-    height_sigma: float = 0.04
-    tilt_sigma: float = 0.3
+#: Roads are drawn about so wide, so that large frames do not make a larger mosaic than tracing needs.
+ROAD_PX = 9.0
+#: A larger mosaic is drawn coarser.
+_MAX_PIXELS = 16_000_000
+#: A pixel is road where more than this share of the frames that see it show one: roads are missed more often than they
+#: are invented.
+_SHARE = 0.34
+#: How much the height over the ground varies during a flight, as a share of it; tangent of a usual tilt of the camera.
+_HEIGHT_SIGMA, _TILT_SIGMA = 0.04, 0.3
 
 
 @dataclass(frozen=True)
@@ -71,7 +56,7 @@ def chain(motion: Sequence[FloatArray] | FloatArray) -> FloatArray:
     return np.stack(matrices)
 
 
-def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = None) -> FloatArray:
+def level(chained: FloatArray, frame: Frame) -> FloatArray:
     """Take chained frames (K, 3, 3) to a plane on which all show about as much ground.
 
     Returns
@@ -79,7 +64,6 @@ def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = Non
     (K, 3, 3) float64
         Pixel of each frame to that plane; its unit is half a frame's diagonal, its origin the middle of the first one.
     """
-    options = options or MosaicOptions()
     unit = frame.half_diagonal
     to_unit = np.array([[1.0, 0.0, -frame.center[0]], [0.0, 1.0, -frame.center[1]], [0.0, 0.0, unit]]) / unit
     local = to_unit @ chained @ np.linalg.inv(to_unit)  # the middle of each frame is (0, 0)
@@ -89,7 +73,7 @@ def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = Non
         # The area scale at a frame's middle is det / w^3, and a line at infinity changes w alone.
         w = local[:, 2, 2] + local[:, :2, 2] @ line
         size = -1.5 * np.log(np.maximum(w, 1e-6))
-        return np.concatenate(((size - size.mean()) / 2.0 / options.height_sigma, line / options.tilt_sigma))
+        return np.concatenate(((size - size.mean()) / 2.0 / _HEIGHT_SIGMA, line / _TILT_SIGMA))
 
     from scipy.optimize import least_squares
 
@@ -99,9 +83,7 @@ def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = Non
     return np.asarray(levelled * np.sign(levelled[:, 2] @ middle)[:, None, None])
 
 
-def lay_together(
-    masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float, options: MosaicOptions | None = None
-) -> Mosaic | None:
+def lay_together(masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float) -> Mosaic | None:
     """Lay frames of one size on one plane; None where no camera above a plane moves so.
 
     Parameters
@@ -111,32 +93,29 @@ def lay_together(
     road_px : float
         Width of a road in the frames.
     """
-    return lay_down(masks, chain(motion), road_px, options)
+    return lay_down(masks, chain(motion), road_px)
 
 
-def lay_down(
-    masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float, options: MosaicOptions | None = None
-) -> Mosaic | None:
+def lay_down(masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float) -> Mosaic | None:
     """Lay frames of one size, whose pixels (K, 3, 3) `to_plane` takes to one plane, on it, levelled; see above."""
-    options = options or MosaicOptions()
     height, width = masks[0].shape
     frame = Frame(width, height)
-    levelled = level(to_plane, frame, options)
+    levelled = level(to_plane, frame)
     corners = np.stack([Homography(matrix)(frame.corners) for matrix in levelled])
     if not _is_sound(corners):
         return None
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    per_unit = frame.half_diagonal * min(1.0, options.road_px / road_px)
-    scale = min(per_unit, float(np.sqrt(options.max_pixels / np.prod(high - low))))
+    per_unit = frame.half_diagonal * min(1.0, ROAD_PX / road_px)
+    scale = min(per_unit, float(np.sqrt(_MAX_PIXELS / np.prod(high - low))))
     to_pixel = np.array([[scale, 0.0, -scale * low[0]], [0.0, scale, -scale * low[1]], [0.0, 0.0, 1.0]])
     to_mosaic = to_pixel @ levelled
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
-    shown, seen, probability = _paint_all(masks, to_mosaic, (rows, columns), options)
+    shown, seen, probability = _paint_all(masks, to_mosaic, (rows, columns))
     return Mosaic(RoadMask(shown, seen, masks[0].name, probability), to_mosaic)
 
 
 def _paint_all(
-    masks: Sequence[RoadMask], matrices: FloatArray, shape: tuple[int, int], options: MosaicOptions
+    masks: Sequence[RoadMask], matrices: FloatArray, shape: tuple[int, int]
 ) -> tuple[BoolArray, BoolArray, AnyArray | None]:
     """Return where frames show road, the ground they observe, and how probable roads are, on a mosaic (rows, columns).
 
@@ -146,7 +125,7 @@ def _paint_all(
     total = np.zeros(shape, np.uint16) if any(mask.probability is not None for mask in masks) else None
     for mask, matrix in zip(masks, matrices, strict=True):
         _paint(mask, matrix, roads, seen, total)
-    shown = (seen > 0) & (roads > options.share * seen)
+    shown = (seen > 0) & (roads > _SHARE * seen)
     if total is None:
         return shown, seen > 0, None
     mean = np.minimum(total // np.maximum(seen, 1), PROBABILITY_SURE)

@@ -27,29 +27,15 @@ from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 from roadgeo.workflows import locate
 
-__all__ = ["Link", "StripOptions", "adjust", "find_links", "find_nets", "place_strips"]
+__all__ = ["Link", "adjust", "find_links", "find_nets", "place_strips"]
 
 
-@dataclass(frozen=True)
-class StripOptions:
-    """How a strip is solved.
-
-    Attributes
-    ----------
-    start_sigma_m : float
-        Standard deviation of a frame in a located mosaic.
-    link_px : float
-        Standard deviation of where a link puts a corner.
-    least_odds : float
-        Log10 odds against places nearby by which a frame agrees with the map.
-    most_gap : float
-        A link is left out if it puts a frame's corners this share of its half diagonal off where the others put them.
-    """
-
-    start_sigma_m: float = 8.0
-    link_px: float = 12.0
-    least_odds: float = 1.0
-    most_gap: float = 0.25
+#: Standard deviation of a frame in a located mosaic, and of where a link puts a corner.
+_START_SIGMA_M, _LINK_PX = 8.0, 12.0
+#: Log10 odds against places nearby by which a frame agrees with the map.
+_LEAST_ODDS = 1.0
+#: A link is left out if it puts a frame's corners this share of its half diagonal off where the others put them.
+_MOST_GAP = 0.25
 
 
 @dataclass(frozen=True)
@@ -75,7 +61,6 @@ def place_strips(
     frames: Sequence[tuple[FlightFrame, AnyArray | None]],
     references: Sequence[Reference],
     options: TrackOptions | None = None,
-    strips: StripOptions | None = None,
 ) -> list[Tracked]:
     """Place frames of one or more strips; return a row for each, in the order in which they lie beside another.
 
@@ -84,16 +69,14 @@ def place_strips(
     frames : sequence of (FlightFrame, (H, W) uint8 or None)
         Their motion is not looked at; beside each its picture in grey, where there is one.
     """
-    strips = strips or StripOptions()
-    options = options or TrackOptions()
-    options = replace(options, start_sigma_m=strips.start_sigma_m, least_odds=strips.least_odds)
+    options = replace(options or TrackOptions(), start_sigma_m=_START_SIGMA_M, least_odds=_LEAST_ODDS)
     stills = [frame for frame, _ in frames]
     links = find_links(stills, [grey for _, grey in frames])
     placed: list[Tracked] = []
-    for net, matrices in find_nets([still.frame for still in stills], links, strips):
+    for net, matrices in find_nets([still.frame for still in stills], links):
         order = _along(matrices, stills[net[0]].frame, [stills[k].name for k in net])
         members = [replace(stills[net[k]], number=n, time_s=stills[n].time_s) for n, k in enumerate(order, len(placed))]
-        of_net = _Net(members, matrices[order], _within([net[k] for k in order], links), options, strips)
+        of_net = _Net(members, matrices[order], _within([net[k] for k in order], links), options)
         placed += of_net.place(references)
     return placed
 
@@ -106,7 +89,6 @@ class _Net:
     matrices: FloatArray
     links: Sequence[Link]
     options: TrackOptions
-    strips: StripOptions
 
     def place(self, references: Sequence[Reference]) -> list[Tracked]:
         """Locate all of them as one mosaic, or else each alone; from the surest the others are placed, link by link."""
@@ -128,7 +110,7 @@ class _Net:
         masks = [frame.mask for frame in frames]
         if not any(mask.roads.any() for mask in masks):
             return [], "no roads are seen"
-        mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks), self.options.mosaic)
+        mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks))
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
         options = tracker.look_options(mosaic, masks)
@@ -151,7 +133,7 @@ class _Net:
             left.remove(link)
             at, to = (link.first, link.other) if link.first in known else (link.other, link.first)
             motion = link.motion if at == link.first else np.asarray(np.linalg.inv(link.motion), float)
-            frame = replace(self.frames[to], motion=motion, motion_px=self.strips.link_px)
+            frame = replace(self.frames[to], motion=motion, motion_px=_LINK_PX)
             beside = tracker.place_beside(known[at], frame)
             if self._stands(beside):
                 known[to] = beside
@@ -198,11 +180,8 @@ def _link(
     return [] if first is None or other is None else overlay(first, other)
 
 
-def find_nets(
-    frames: Sequence[Frame], links: Sequence[Link], options: StripOptions | None = None
-) -> list[tuple[list[int], FloatArray]]:
+def find_nets(frames: Sequence[Frame], links: Sequence[Link]) -> list[tuple[list[int], FloatArray]]:
     """Return the nets that links make, the largest first: its frames, and (K, 3, 3) from their pixels to one plane."""
-    options = options or StripOptions()
     nets = [[k] for k in range(len(frames))]
     at: list[FloatArray] = [np.eye(3) for _ in frames]
     kept: list[Link] = []
@@ -216,7 +195,7 @@ def find_nets(
                 at[k] = at[k] / np.cbrt(np.linalg.det(at[k]))
             mine += theirs
             nets.remove(theirs)
-        elif _gap(at[link.first] @ link.motion, at[link.other], frames[link.other]) > options.most_gap:
+        elif _gap(at[link.first] @ link.motion, at[link.other], frames[link.other]) > _MOST_GAP:
             continue
         kept.append(link)
     nets.sort(key=len, reverse=True)

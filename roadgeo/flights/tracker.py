@@ -17,8 +17,8 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
-from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
-from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
+from roadgeo.flights.candidates import Candidates, Look
+from roadgeo.flights.mosaic import Mosaic, lay_together
 from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
@@ -64,8 +64,6 @@ class TrackOptions:
     """
 
     locate: LocateOptions = field(default_factory=LocateOptions)
-    mosaic: MosaicOptions = field(default_factory=MosaicOptions)
-    candidates: CandidateOptions = field(default_factory=CandidateOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
     most_frames: int = 32
     fewest_intersections: int = 6
@@ -168,8 +166,7 @@ class Tracker:
         self._reference: Reference | None = None
         self._doubtful: list[_Waiting] = []  # frames in a row that do not agree
         self._window: list[_Waiting] = []
-        self._looked_at = self._waited = 0
-        self._candidates = self._no_candidates()
+        self._forget()
 
     @property
     def is_lost(self) -> bool:
@@ -240,13 +237,10 @@ class Tracker:
         self._forget()
         return [Tracked(doubt.frame, "lost", why, known_at) for doubt in doubtful]
 
-    def _no_candidates(self) -> Candidates:
-        return Candidates(self.references, self.options.candidates)
-
     def _forget(self) -> None:
         """Forget what earlier frames proposed."""
         self._looked_at = self._waited = 0
-        self._candidates = self._no_candidates()
+        self._candidates = Candidates(self.references)
 
     # --- searching ----------------------------------------------------------------------------------------------------
 
@@ -258,7 +252,7 @@ class Tracker:
             self._forget()
         self._window = [*self._window, waiting][-self.options.most_frames :]
         masks = [member.frame.mask for member in self._window]
-        mosaic = lay_together(masks, [_motion(member) for member in self._window], _road_px(masks), self.options.mosaic)
+        mosaic = lay_together(masks, [_motion(member) for member in self._window], _road_px(masks))
         if mosaic is None:
             self._window = [waiting]
             self._forget()

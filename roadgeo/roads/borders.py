@@ -14,47 +14,21 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
 
-__all__ = ["BorderOptions", "find_border"]
+__all__ = ["find_border"]
 
-#: Rows of a margin, at least.
-_LEAST_DEPTH = 3
-
-
-@dataclass(frozen=True)
-class BorderOptions:
-    """When something is no part of the map.
-
-    Attributes
-    ----------
-    solid : float
-        Rows and columns of a margin are road by at least this share.
-    most : float
-        Largest share of the sheet's side that is cut from one side.
-    max_turn_deg : float
-        Sheets lie askew on a scanner by no more.
-    least_line : float
-        Share of a side that the line around the map must cover.
-    most_crossed : float
-        Share of it where there may be road just beyond it.
-    least_sides : int
-        Number of sides that must have a line.
-    least_marks : int
-        Number of marks in a caption.
-    max_mark : float
-        Each is no wider than this share of the sheet.
-    max_side : int
-        Larger sheets are reduced to this before they are looked at.
-    """
-
-    solid: float = 0.9
-    most: float = 0.3
-    max_turn_deg: float = 2.5
-    least_line: float = 0.6
-    most_crossed: float = 0.004
-    least_sides: int = 3
-    least_marks: int = 6
-    max_mark: float = 0.12
-    max_side: int = 800
+#: Rows of a margin, at least; rows and columns of one are road by at least this share.
+_LEAST_DEPTH, _SOLID = 3, 0.9
+#: Largest share of the sheet's side that is cut from one side.
+_MOST = 0.3
+#: Sheets lie askew on a scanner by no more.
+_MAX_TURN_DEG = 2.5
+#: Share of a side that the line around the map must cover, and where there may be road just beyond it; number of sides
+#: that must have a line.
+_LEAST_LINE, _MOST_CROSSED, _LEAST_SIDES = 0.6, 0.004, 3
+#: Number of marks in a caption; each is no wider than this share of the sheet.
+_LEAST_MARKS, _MAX_MARK = 6, 0.12
+#: Larger sheets are reduced to this side before they are looked at.
+_MAX_SIDE = 800
 
 
 @dataclass(frozen=True)
@@ -65,7 +39,7 @@ class _Line:
     slope: float
 
 
-def find_border(roads: BoolArray, road_width_px: float, options: BorderOptions | None = None) -> BoolArray | None:
+def find_border(roads: BoolArray, road_width_px: float) -> BoolArray | None:
     """Return which pixels of a sheet lie on its map, (H, W) bool; None where all of them may.
 
     Parameters
@@ -73,18 +47,17 @@ def find_border(roads: BoolArray, road_width_px: float, options: BorderOptions |
     roads : (H, W) bool
     road_width_px : float
     """
-    options = options or BorderOptions()
-    factor = max(1, -(-max(roads.shape) // options.max_side))
+    factor = max(1, -(-max(roads.shape) // _MAX_SIDE))
     small = _reduced(roads, factor)
     width = max(road_width_px / factor, 1.0)
     on_map = np.ones(small.shape, np.bool_)
     for turns in range(4):  # as seen from each side: a margin's first row is row 0
         seen = np.rot90(on_map, turns)
-        seen[: _solid_depth(np.rot90(small, turns), options)] = False
+        seen[: _solid_depth(np.rot90(small, turns))] = False
     for turns in range(4):
         seen = np.rot90(on_map, turns)
-        seen[: _caption_depth(np.rot90(small & on_map, turns), width, options)] = False
-    for turns, line in _find_lines(small & on_map, width, options):
+        seen[: _caption_depth(np.rot90(small & on_map, turns), width)] = False
+    for turns, line in _find_lines(small & on_map, width):
         _cut(np.rot90(on_map, turns), line)
     if on_map.all() or not (small & on_map).any():
         return None
@@ -102,12 +75,12 @@ def _reduced(roads: BoolArray, factor: int) -> BoolArray:
     return np.asarray(cv2.resize(roads.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0)
 
 
-def _solid_depth(roads: BoolArray, options: BorderOptions) -> int:
+def _solid_depth(roads: BoolArray) -> int:
     """Return the rows of a solid margin, 0 for none; its ragged edge belongs to it."""
-    if (roads[:_LEAST_DEPTH].mean(axis=1) < options.solid).any():
+    if (roads[:_LEAST_DEPTH].mean(axis=1) < _SOLID).any():
         return 0
-    share = roads[: int(options.most * len(roads))].mean(axis=1)
-    solid = share >= options.solid
+    share = roads[: int(_MOST * len(roads))].mean(axis=1)
+    solid = share >= _SOLID
     depth = int(np.argmin(solid)) if not solid.all() else 0
     if depth < _LEAST_DEPTH:
         return 0
@@ -115,10 +88,10 @@ def _solid_depth(roads: BoolArray, options: BorderOptions) -> int:
     return depth + (int(np.flatnonzero(ragged)[-1]) + 1 if ragged.any() else 0)
 
 
-def _caption_depth(roads: BoolArray, width: float, options: BorderOptions) -> int:
+def _caption_depth(roads: BoolArray, width: float) -> int:
     """Return the rows of a strip of small marks, with the empty strip between them and the map; 0 for none."""
     height, wide = roads.shape
-    empty = ~roads[: int(options.most * height)].any(axis=1)
+    empty = ~roads[: int(_MOST * height)].any(axis=1)
     shown = np.flatnonzero(~empty)
     if not len(shown):
         return 0
@@ -129,33 +102,33 @@ def _caption_depth(roads: BoolArray, width: float, options: BorderOptions) -> in
     for depth in sorted(inner, reverse=True):
         _, _, boxes, _ = cv2.connectedComponentsWithStats(roads[:depth].astype(np.uint8))
         marks = boxes[1:]
-        small = marks[:, cv2.CC_STAT_WIDTH] <= options.max_mark * wide
-        if len(marks) >= options.least_marks and small.all():
+        small = marks[:, cv2.CC_STAT_WIDTH] <= _MAX_MARK * wide
+        if len(marks) >= _LEAST_MARKS and small.all():
             return int(depth)
     return 0
 
 
-def _find_lines(roads: BoolArray, width: float, options: BorderOptions) -> list[tuple[int, _Line]]:
+def _find_lines(roads: BoolArray, width: float) -> list[tuple[int, _Line]]:
     """Return the lines of sides, by the quarter turns that bring them to the top; none where too few sides have one."""
     found: list[tuple[int, _Line]] = []
     for turns in range(4):
-        line = _find_line(np.rot90(roads, turns), width, options)
+        line = _find_line(np.rot90(roads, turns), width)
         if line is not None:
             found.append((turns, line))
-        elif turns + 1 - len(found) > 4 - options.least_sides:
+        elif turns + 1 - len(found) > 4 - _LEAST_SIDES:
             return []
     return found
 
 
-def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line | None:
+def _find_line(roads: BoolArray, width: float) -> _Line | None:
     """Return the innermost line along the first rows that no road crosses, or None."""
     beyond = round(1.5 * width) + 1
-    slopes = np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21)))
+    slopes = np.tan(np.radians(np.linspace(-_MAX_TURN_DEG, _MAX_TURN_DEG, 21)))
     found: list[tuple[float, _Line]] = []
-    covers = _covers(roads, int(options.most * len(roads)), slopes)
-    able = (covers >= options.least_line).any(axis=1)
+    covers = _covers(roads, int(_MOST * len(roads)), slopes)
+    able = (covers >= _LEAST_LINE).any(axis=1)
     for slope, cover in zip(slopes[able], covers[able], strict=True):
-        line = _innermost(cover, beyond, options)
+        line = _innermost(cover, beyond)
         if line is not None:
             found.append((float(cover[line]), _Line(line + 1.0, float(slope))))
     if not found:
@@ -182,16 +155,16 @@ def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> FloatArray:
     return np.asarray(np.add.reduceat(runs, np.flatnonzero(starts == 0)) / wide)
 
 
-def _innermost(cover: FloatArray, beyond: int, options: BorderOptions) -> int | None:
+def _innermost(cover: FloatArray, beyond: int) -> int | None:
     """Return the last row of the innermost line that nothing crosses, of the share (D,) of each row that is road."""
-    on_line = cover >= options.least_line
+    on_line = cover >= _LEAST_LINE
     for last in np.flatnonzero(on_line[:-1] & ~on_line[1:])[::-1]:  # where a line ends, seen from outside
         first = int(last)
-        while first > 0 and cover[first - 1] > options.most_crossed:
+        while first > 0 and cover[first - 1] > _MOST_CROSSED:
             first -= 1
         # Just beyond the line there is nothing; or the line is the end of the sheet.
         outside = cover[max(first - beyond, 0) : first]
-        is_clear = (outside <= options.most_crossed).all() if first else cover[0] >= options.least_line
+        is_clear = (outside <= _MOST_CROSSED).all() if first else cover[0] >= _LEAST_LINE
         if last - first <= 3 * beyond and is_clear:
             return int(last)
     return None

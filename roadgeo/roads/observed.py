@@ -13,42 +13,20 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
 
-__all__ = ["VoidOptions", "find_voids"]
+__all__ = ["find_voids"]
 
-
-@dataclass(frozen=True)
-class VoidOptions:
-    """When a line is taken for the side of a warped frame.
-
-    Attributes
-    ----------
-    sure_ends
-        Roads that must end on one line before anything is cut at all.
-    least_ends
-        Roads that must end on every further line.
-    straightness_px
-        How far the ends may lie off their line.
-    min_length
-        Length of the line between the outermost ends, as a share of the frame's shorter side.
-    wide
-        Beyond a line with this share of the frame, fewer roads need end on it: of 360 masks without a void 31 had one
-        on which 3 roads end, and at most 0.07 of the frame lay beyond any of them.
-    wide_ends
-        Number of those. One of 55 real masks had a line with 3 ends beside a wood, 0.33 of the frame's side long.
-    wide_length
-        As `min_length`, of a line with fewer than `least_ends`.
-    max_cut
-        Largest share of the frame that may lie beyond one line.
-    """
-
-    sure_ends: int = 5
-    least_ends: int = 4
-    straightness_px: float = 1.5
-    min_length: float = 0.12
-    wide: float = 0.15
-    wide_ends: int = 3
-    wide_length: float = 0.45
-    max_cut: float = 0.75
+#: Roads that must end on one line before anything is cut at all, and on every further line.
+SURE_ENDS, LEAST_ENDS = 5, 4
+#: How far the ends may lie off their line, pixels.
+_STRAIGHTNESS_PX = 1.5
+#: Length of the line between the outermost ends, as a share of the frame's shorter side.
+_MIN_LENGTH = 0.12
+#: Beyond a line with this share of the frame, fewer roads need end on it: of 360 masks without a void 31 had one on
+#: which 3 roads end, and at most 0.07 of the frame lay beyond any of them. One of 55 real masks had a line with 3 ends
+#: beside a wood, 0.33 of the frame's side long.
+_WIDE, _WIDE_ENDS, _WIDE_LENGTH = 0.15, 3, 0.45
+#: Largest share of the frame that may lie beyond one line.
+_MAX_CUT = 0.75
 
 
 @dataclass(frozen=True)
@@ -62,29 +40,27 @@ class _Side:
     bulge: float  # how far roads reach beyond the line
 
 
-def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | None = None) -> BoolArray | None:
+def find_voids(roads: BoolArray, road_width_px: float) -> BoolArray | None:
     """Return which pixels were observed, or None where all of them may have been.
 
     Parameters
     ----------
     roads : (H, W) bool
     road_width_px : float
-    options : VoidOptions, optional
 
     Returns
     -------
     (H, W) bool or None
     """
-    options = options or VoidOptions()
-    sides = _sides(_hull(roads), roads.shape, options)
+    sides = _sides(_hull(roads), roads.shape)
     ends = [_count_ends(roads, side, road_width_px) for side in sides]
-    is_warped = max(ends, default=0) >= options.sure_ends
+    is_warped = max(ends, default=0) >= SURE_ENDS
     observed = np.ones(roads.shape, np.bool_)
     for side, n in zip(sides, ends, strict=True):
-        is_long = n >= options.wide_ends and side.length >= options.wide_length * min(roads.shape)
-        if n >= options.least_ends or is_long:
-            least = 0.0 if is_warped and n >= options.least_ends else options.wide
-            _cut(observed, side, least, options.max_cut)
+        is_long = n >= _WIDE_ENDS and side.length >= _WIDE_LENGTH * min(roads.shape)
+        if n >= LEAST_ENDS or is_long:
+            least = 0.0 if is_warped and n >= LEAST_ENDS else _WIDE
+            _cut(observed, side, least, _MAX_CUT)
     return None if observed.all() else observed
 
 
@@ -121,7 +97,7 @@ def _hull(roads: BoolArray) -> FloatArray:
     return np.asarray(hull[:, 0], np.float64)
 
 
-def _sides(hull: FloatArray, shape: tuple[int, ...], options: VoidOptions) -> list[_Side]:
+def _sides(hull: FloatArray, shape: tuple[int, ...]) -> list[_Side]:
     """Return the straight stretches of a hull that are not the frame itself, longest first, apart from each other."""
     n = len(hull)
     stretches = []
@@ -129,7 +105,7 @@ def _sides(hull: FloatArray, shape: tuple[int, ...], options: VoidOptions) -> li
         longest = None
         for k in range(1, n):
             side = _side(hull[(i + np.arange(k + 1)) % n])
-            if side.bulge > options.straightness_px:
+            if side.bulge > _STRAIGHTNESS_PX:
                 break
             longest = (side.length, i, k, side)
         if longest is not None:
@@ -139,7 +115,7 @@ def _sides(hull: FloatArray, shape: tuple[int, ...], options: VoidOptions) -> li
     sides = []
     for length, i, k, side in stretches:
         steps = (i + np.arange(k)) % n
-        if length < options.min_length * min(shape):
+        if length < _MIN_LENGTH * min(shape):
             break
         if taken[steps].any():
             continue

@@ -89,10 +89,10 @@ def test_an_interrupted_run_says_that_it_can_go_on(town, tmp_path, capsys, monke
     options = ["evaluate", town, "-n", 3, "--noise", "clean", *SMALL, "-o", tmp_path]
     draw = trials.simulate_query
 
-    def interrupted(landscape, options, k):
+    def interrupted(landscape, options, k, center):
         if k == 2:
             raise KeyboardInterrupt
-        return draw(landscape, options, k)
+        return draw(landscape, options, k, center)
 
     monkeypatch.setattr(trials, "simulate_query", interrupted)
     assert run(*options) == 130

@@ -5,7 +5,7 @@ import pytest
 
 from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
+from roadgeo.flights.candidates import PER_LOOK, Candidates, Look
 from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
@@ -68,12 +68,13 @@ def test_each_search_takes_its_share_off(flown):
     assert before == pytest.approx(odds[0], abs=1.0)
 
 
-def test_no_more_than_so_many_places_are_kept_those_that_explain_most(flown):
-    all_of_them, few = Candidates([flown[2]]), Candidates([flown[2]], CandidateOptions(most=3))
-    for entry in (all_of_them, few):
-        entry.look(look_at(flown, 4, True), weak())
+def test_no_more_than_so_many_places_are_kept_those_that_explain_most(flown, monkeypatch):
+    all_of_them, few = Candidates([flown[2]]), Candidates([flown[2]])
+    all_of_them.look(look_at(flown, 4, True), weak())
+    monkeypatch.setattr("roadgeo.flights.candidates.MOST", 3)
+    few.look(look_at(flown, 4, True), weak())
     worth = sorted((item.fit.log10_likelihood for item in all_of_them._kept), reverse=True)
-    assert len(all_of_them) <= 2 * CandidateOptions().per_look  # of a quick search, and of a full one
+    assert len(all_of_them) <= 2 * PER_LOOK  # of a quick search, and of a full one
     assert len(few) == 3
     assert [item.fit.log10_likelihood for item in few._kept] == pytest.approx(worth[:3])
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from roadgeo.flights.mosaic import MosaicOptions, chain, lay_together, level
+from roadgeo.flights.mosaic import ROAD_PX, chain, lay_together, level
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
@@ -43,7 +43,7 @@ def test_roads_that_one_frame_misses_are_taken_from_others():
     broken = roads.copy()
     broken[100:200] = False
     masks = [RoadMask(item) for item in (roads, broken, roads, roads)]
-    mosaic = lay_together(masks, motion, 20.0, MosaicOptions(road_px=20.0))
+    mosaic = lay_together(masks, motion, ROAD_PX)
     assert mosaic is not None
     for k, matrix in enumerate(mosaic.to_mosaic):
         column, row = np.floor(Homography(matrix)(np.array([160.5, 120.5]))).astype(int)
@@ -62,7 +62,7 @@ def test_a_mosaic_is_as_sure_as_its_frames():
     roads = np.zeros((240, 320), bool)
     roads[:, 150:170] = True
     frames = [RoadMask(roads, probability=np.where(roads, sure, 30).astype(np.uint8)) for sure in (200, 100, 200, 100)]
-    mosaic = lay_together(frames, motion, 20.0, MosaicOptions(road_px=20.0))
+    mosaic = lay_together(frames, motion, ROAD_PX)
     assert mosaic is not None
     assert mosaic.mask.probability is not None
     assert mosaic.mask.observed is not None

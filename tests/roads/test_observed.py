@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from roadgeo.roads.observed import VoidOptions, find_voids
+from roadgeo.roads.observed import find_voids
 
 SIZE, WIDTH = 600, 7
 
@@ -61,10 +61,12 @@ def test_a_road_along_the_hull_is_no_row_of_ends() -> None:
     assert find_voids(image > 0, WIDTH) is None
 
 
-def test_few_ends_are_not_enough() -> None:
+def test_few_ends_are_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     roads, _ = warped(city(spacing=190), [(300, -60), (660, 300), (300, 660), (-60, 300)])
     assert find_voids(roads, WIDTH) is None
-    assert find_voids(roads, WIDTH, VoidOptions(sure_ends=2, least_ends=2)) is not None
+    monkeypatch.setattr("roadgeo.roads.observed.SURE_ENDS", 2)
+    monkeypatch.setattr("roadgeo.roads.observed.LEAST_ENDS", 2)
+    assert find_voids(roads, WIDTH) is not None
 
 
 def test_half_a_frame_is_told_by_three_ends() -> None:
