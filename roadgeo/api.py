@@ -474,11 +474,10 @@ def track(
     IndexFormatError
         A reference is missing or unusable.
     """
-    from roadgeo.flights.frames import FrameOptions, read_frames, read_stills
+    from roadgeo.flights.frames import FrameOptions, follow_frames
     from roadgeo.flights.motion import read_motion
     from roadgeo.flights.rows import make_rows
-    from roadgeo.flights.strips import place_strips
-    from roadgeo.flights.tracker import TrackOptions, follow
+    from roadgeo.flights.tracker import TrackOptions, latest
 
     given = {"gsd": gsd, "near": near, "within": within, "max_tilt": max_tilt, "time_limit": time_limit}
     options = TrackOptions(locate=_with_hints(LocateOptions(), given, None))
@@ -486,12 +485,7 @@ def track(
     reading = FrameOptions(gsd_m=_hint("gsd", gsd), motion=moved, every_s=every, interval_s=interval)
     paths = [os.fspath(frame) for frame in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
     opened: Any = _open(reference)
-    if unordered:
-        tracked = list(place_strips(list(read_stills(paths, reading)), opened, options))
-    else:
-        learnt = follow(read_frames(paths, reading), opened, options)
-        known = {new.frame.number: new for _, news in learnt for new in news}
-        tracked = [known[number] for number in sorted(known)]
+    tracked = latest(follow_frames(paths, reading, opened, options, unordered))
     if not tracked:
         raise MaskError(f"no frames in {', '.join(paths)}")
     return make_rows(tracked, start, _hint("focal", focal))

@@ -34,7 +34,7 @@ from roadgeo.storage.files import make_folder
 if TYPE_CHECKING:
     from roadgeo.flights.frames import FrameOptions
     from roadgeo.flights.rows import Row
-    from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions
+    from roadgeo.flights.tracker import Tracked
 
 __all__ = ["track_command"]
 
@@ -144,16 +144,18 @@ def track_command(
     """Follow a flight over the map, frame by frame; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
+    from roadgeo.flights.frames import follow_frames
     from roadgeo.flights.report import Thumbnails
     from roadgeo.flights.rows import make_rows
+    from roadgeo.flights.tracker import TrackOptions
     from roadgeo.running.batch import open_references
 
     if focal_px == "exif":
         raise click.UsageError("--focal exif: of frames give the focal length in pixels.")
     if unordered and (mavlink or given["motion"]):
         raise click.UsageError("--unordered frames are no flight: leave out --mavlink and --motion.")
-    options, reading = _track_options(given), _frame_options(given)
-    opened = open_references(references, print_steps(quiet))
+    options, reading = TrackOptions(locate=make_options(hinted(given))), _frame_options(given)
+    opened: Any = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)
     make_folder(out_dir)
     compile_once(quiet)
@@ -161,8 +163,7 @@ def track_command(
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
     with _sender(mavlink) as send:
-        follow = _place_all if unordered else _follow
-        for frame, news in follow(frames, reading, opened, options):
+        for frame, news in follow_frames(frames, reading, opened, options, unordered):
             pictures.add(frame.number, frame.mask)
             known.update({state.frame.number: _without_mask(state) for state in news})
             fresh = make_rows(news, start, focal_px)
@@ -180,25 +181,6 @@ def track_command(
         summary = ", ".join(f"{n} {status}" for status, n in counts.items())
         echo(f"{len(rows)} frames: {summary}; wrote {', '.join(files)}", err=True)
     return NOT_LOCATED if counts["lost"] else 0
-
-
-def _follow(
-    frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
-) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    from roadgeo.flights.frames import read_frames
-    from roadgeo.flights.tracker import follow
-
-    return follow(read_frames(frames, reading), opened, options)
-
-
-def _place_all(
-    frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
-) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    from roadgeo.flights.frames import read_stills
-    from roadgeo.flights.strips import place_strips
-
-    for tracked in place_strips(list(read_stills(frames, reading)), opened, options):
-        yield tracked.frame, [tracked]
 
 
 @contextmanager
@@ -220,12 +202,6 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
             read_at = time.time()
 
         yield send
-
-
-def _track_options(given: dict[str, Any]) -> TrackOptions:
-    from roadgeo.flights.tracker import TrackOptions
-
-    return TrackOptions(locate=make_options(hinted(given)))
 
 
 def _frame_options(given: dict[str, Any]) -> FrameOptions:

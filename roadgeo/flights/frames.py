@@ -19,15 +19,17 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.flights.motion import Odometer, between_images
-from roadgeo.flights.tracker import FlightFrame
+from roadgeo.flights.strips import place_strips
+from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions, follow
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import load_model
 from roadgeo.running.tasks import SUFFIXES, find_masks, in_natural_order
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.files import writing
 
-__all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
+__all__ = ["VIDEOS", "FrameOptions", "follow_frames", "read_frames", "read_stills"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -128,6 +130,26 @@ def read_stills(
                 mask, grey = _read(image, options, last)
                 frame = replace(frame, mask=mask)
             yield frame, grey
+
+
+def follow_frames(
+    arguments: Sequence[str],
+    reading: FrameOptions,
+    references: Sequence[Reference],
+    options: TrackOptions,
+    unordered: bool = False,
+) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
+    """Read frames, and follow them; or place those that are in no order. Yield each with the states that it changes.
+
+    Raises
+    ------
+    MaskError, ModelError
+        As of `read_frames`.
+    """
+    if unordered:
+        placed = place_strips(list(read_stills(arguments, reading)), references, options)
+        return ((tracked.frame, [tracked]) for tracked in placed)
+    return follow(read_frames(arguments, reading), references, options)
 
 
 def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:

@@ -32,7 +32,7 @@ from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 
-__all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
+__all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest", "track"]
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
@@ -352,9 +352,12 @@ def track(
     frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
 ) -> list[Tracked]:
     """Follow a flight to its end; return the final state of each frame, in order."""
-    known: dict[int, Tracked] = {}
-    for _, news in follow(frames, references, options):
-        known.update({tracked.frame.number: tracked for tracked in news})
+    return latest(follow(frames, references, options))
+
+
+def latest(learnt: Iterable[tuple[FlightFrame, list[Tracked]]]) -> list[Tracked]:
+    """Return the final state of each frame, in order."""
+    known = {state.frame.number: state for _, news in learnt for state in news}
     return [known[number] for number in sorted(known)]
 
 
