@@ -11,7 +11,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo._text import counted
-from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, make_cluster, row, take
+from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
 
@@ -65,10 +65,6 @@ def index_command(
     replace: bool,
     rebuild: str | None,
     shards: dict[str, Any] | None,
-    margin: float,
-    jobs: int,
-    engine: str | None,
-    scheduler: str | None,
     quiet: bool,
     verbose: bool,
     **source: Any,
@@ -88,10 +84,6 @@ def index_command(
       roadgeo index --roads germany.osm.pbf --shards auto --jobs 4
       roadgeo index --osm "Massachusetts" --coarse --name massachusetts-main
     \f
-
-    With --update the reference named by --name (in the library) or --out is changed: on the ground asked for (the
-    place, the box, the polygon, or where the roads of --roads lie) its roads are replaced, or added where it has none.
-    The rest stays as it is, and so do the options it was built with.
 
     With --shards a map of any size is built piece by piece from road files, in as much memory as one piece needs; the
     result is a folder, REF.shards, and is searched as one map. The same command goes on with a build cut short.
@@ -116,8 +108,7 @@ def index_command(
         _require_geopackage(out)
     name = name or _name(source, given, out)
     if shards is not None:
-        cluster = make_cluster(engine, scheduler, jobs)
-        build_in_shards(source, name, out, shards, margin, jobs, cluster, quiet)
+        build_in_shards(source, name, out, shards, quiet)
         return
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -180,12 +180,7 @@ def locate_command(
     references: tuple[str, ...],
     out_dir: str,
     as_json: bool,
-    method: Literal["auto", "pair"],
-    skip_existing: bool,
     jobs: int,
-    engine: str | None,
-    scheduler: str | None,
-    divide_map: bool,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -194,7 +189,7 @@ def locate_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import count_up, print_steps, show_steps
 
-    options = make_options(hinted(given), method)
+    options = make_options(hinted(given), given["method"])
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]), take=given["take"])
     outputs = _output_options(given)
     found = find_masks(masks, given["recursive"])
@@ -202,11 +197,9 @@ def locate_command(
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     others = found[1:] if given["fuse"] else []
     tasks = name_tasks(found[:1] if given["fuse"] else found)
-    cluster = make_cluster(engine, scheduler, jobs)
-    if divide_map:
-        if cluster is None or method == "pair" or given["explain"]:
-            raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
-        cluster = replace(cluster, divide_map=True)
+    cluster = make_cluster(given, jobs)
+    if given["divide_map"] and (cluster is None or given["method"] == "pair" or given["explain"]):
+        raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
     # A mask alone gets threads; on a cluster each worker keeps to one.
     options = replace(options, threads=jobs if len(tasks) == 1 and cluster is None else 1)
     make_folder(out_dir)
@@ -218,7 +211,7 @@ def locate_command(
         images=photos,
         exif=given["focal_px"] == "exif",
         dem=given["dem"],
-        skip_existing=skip_existing,
+        skip_existing=given["skip_existing"],
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
     # Opened here too: their errors are printed once, and the search is compiled before processes start.
@@ -228,15 +221,7 @@ def locate_command(
     outcomes: list[Outcome] = []
     is_single = len(tasks) == 1
     with show_steps(quiet or not is_single) as say, count_up(len(tasks), quiet, as_json, _summarize) as count:
-        for outcome in locate_masks(
-            tasks,
-            references,
-            out_dir,
-            asked,
-            jobs=jobs,
-            cluster=cluster,
-            say=say,
-        ):
+        for outcome in locate_masks(tasks, references, out_dir, asked, jobs=jobs, cluster=cluster, say=say):
             outcomes.append(outcome)
             count(outcome.status)
             _report(outcome, as_json, quiet, verbose, single=is_single)
@@ -256,13 +241,8 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.orthophoto import ImageOptions
 
-    asked = [
-        *given["products"],
-        *([GCPS.name] if given["gcps"] else []),
-        *([OVERLAY.name] if given["plot"] else []),
-        *([REPORT.name] if given["report"] else []),
-        *([EXPLANATION.name, EXPLANATION_PICTURE.name] if given["explain"] else []),
-    ]
+    switches = {"gcps": [GCPS], "plot": [OVERLAY], "report": [REPORT], "explain": [EXPLANATION, EXPLANATION_PICTURE]}
+    asked = [*given["products"], *(output.name for name, some in switches.items() if given[name] for output in some)]
     image = ImageOptions(
         given["crs"], given["resolution"], given["resampling"], given["max_pixels"], given["compression"]
     )
@@ -334,15 +314,10 @@ def describe(outcome: Outcome) -> str:
 
 def _summarize(counts: Counter[str]) -> str:
     """Print how many masks had which result."""
-    parts = [f"{counts['located']} located"]
-    if counts["chosen"]:
-        parts.append(f"{counts['chosen']} chosen")
-    if counts["ambiguous"]:
-        parts.append(f"{counts['ambiguous']} ambiguous")
-    parts.append(f"{counts['not_located']} not located")
-    if counts["error"]:
-        parts.append(f"{counts['error']} failed")
-    return ", ".join(parts)
+    said = {"located": "located", "chosen": "chosen", "ambiguous": "ambiguous", "not_located": "not located"}
+    said["error"] = "failed"
+    always = ("located", "not_located")
+    return ", ".join(f"{counts[name]} {text}" for name, text in said.items() if counts[name] or name in always)
 
 
 def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single: bool) -> None:

@@ -457,7 +457,7 @@ def read_options(given: Mapping[str, Any], others: Sequence[str] = (), jobs: int
     return ReadOptions(**{**known, "fused_with": tuple(others), "threads": n_threads(jobs), "mirror": mirror})
 
 
-def make_cluster(engine: str | None, scheduler: str | None, jobs: int) -> Cluster | None:
+def make_cluster(given: Mapping[str, Any], jobs: int) -> Cluster | None:
     """Return the cluster that was asked for, None for processes of this machine.
 
     Raises
@@ -465,10 +465,10 @@ def make_cluster(engine: str | None, scheduler: str | None, jobs: int) -> Cluste
     click.UsageError
         A scheduler and another engine.
     """
-    if scheduler is None and engine != "dask":
+    if given["scheduler"] is None and given["engine"] != "dask":
         return None
-    if engine == "local":
+    if given["engine"] == "local":
         raise click.UsageError("--scheduler goes with --engine dask.")
     from roadgeo.running.cluster import Cluster
 
-    return Cluster(scheduler, jobs)
+    return Cluster(given["scheduler"], jobs, bool(given.get("divide_map")))

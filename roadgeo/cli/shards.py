@@ -5,15 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from roadgeo.cli.options import each, row
+from roadgeo.cli.options import each, make_cluster, row
 from roadgeo.cli.printing import echo
-
-if TYPE_CHECKING:
-    from roadgeo.running.cluster import Cluster
 
 __all__ = ["build_in_shards", "shard_options"]
 
@@ -56,16 +53,7 @@ shard_options = each((
 ))  # fmt: skip
 
 
-def build_in_shards(
-    source: dict[str, Any],
-    name: str,
-    out: str | None,
-    shards: dict[str, Any],
-    margin: float,
-    jobs: int,
-    cluster: Cluster | None,
-    quiet: bool,
-) -> None:
+def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any], quiet: bool) -> None:
     """Build a reference in shards from road files, and describe the result.
 
     Raises
@@ -91,18 +79,12 @@ def build_in_shards(
         path = path.with_name(f"{path.name}{ENDING}")
     make_folder(path)
     # Sources and options.
-    files = RoadFiles(
-        tuple(map(Path, source["roads"])),
-        source["layer"],
-        source["crs"],
-        source["kinds"],
-        source["tunnels"],
-        source["bbox"],
-        source["attribution"],
-    )
+    which = (source[name] for name in ("layer", "crs", "kinds", "tunnels", "bbox", "attribution"))
+    files = RoadFiles(tuple(map(Path, source["roads"])), *which)
     compile_once(quiet, map_only=True)
     with show_steps(quiet) as say:
-        options = ShardOptions(**shards, margin_m=margin)
+        options, jobs = ShardOptions(**shards, margin_m=source["margin"]), source["jobs"]
+        cluster = make_cluster(source, jobs)
         reference = build_shards(files, path, make_slug(name), options, jobs=jobs, cluster=cluster, say=say)
     if not quiet:
         entries = reference.manifest.filled

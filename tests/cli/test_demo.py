@@ -21,6 +21,7 @@ def located(mask: DemoMask, east_m: float) -> Outcome:
     homography[0] += east_m * homography[2]
     lon, lat = to_lonlat(mask.crs, Homography(homography)(Frame(*size).center)[None])[0]
     found = {
+        "status": "located",
         "size": size, "homography": homography.tolist(), "crs": mask.crs, "center": {"lon": lon, "lat": lat},
         "n_matched": 20, "reason": "all agree", "seconds": {"total": 2.0, "open": 0.5, "write": 0.5},
     }  # fmt: skip
