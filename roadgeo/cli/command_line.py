@@ -10,21 +10,20 @@ import click
 
 from roadgeo import __version__
 
-__all__ = ["KEY", "made_by", "said_options", "typed_command"]
+__all__ = ["KEY", "made_by", "said_options"]
 
 #: Under which the arguments are kept among what click's contexts share.
 KEY = "roadgeo.arguments"
 
 
-def typed_command() -> list[str]:
-    """Return the command that runs now, word by word; only the program's name where another program calls it."""
-    context = click.get_current_context(silent=True)
-    return ["roadgeo", *([] if context is None else context.meta.get(KEY, []))]
-
-
 def made_by() -> dict[str, Any]:
-    """Return the origin that every JSON names: the version, and the command."""
-    return {"version": __version__, "command": shlex.join(typed_command())}
+    """Return the origin that every JSON names: the version, and the command that runs now.
+
+    That is only the program's name where another program calls it.
+    """
+    context = click.get_current_context(silent=True)
+    typed = [] if context is None else context.meta.get(KEY, [])
+    return {"version": __version__, "command": shlex.join(["roadgeo", *typed])}
 
 
 def said_options(left_out: Collection[str] = ()) -> list[str]:

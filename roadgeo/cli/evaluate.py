@@ -119,12 +119,8 @@ def evaluate_command(
 
 
 #: Names of the search's hints in the settings of an evaluation.
-_HINTED = {
-    "gsd_m": "known_gsd",
-    "max_tilt_deg": "max_tilt",
-    "north_up": "north_up",
-    "effort": "effort",
-    "time_limit_s": "time_limit_s",
+_HINTED = {"gsd_m": "known_gsd", "max_tilt_deg": "max_tilt"} | {
+    key: key for key in ("north_up", "effort", "time_limit_s")
 }
 
 

@@ -212,16 +212,8 @@ def _one_source(source: dict[str, Any]) -> str:
 def _read(source: dict[str, Any], given: str, say: Say) -> Roads:
     from roadgeo.sources.roads import read_roads
 
-    return read_roads(
-        source[given],
-        source["layer"],
-        source["crs"],
-        source["kinds"],
-        tunnels=source["tunnels"],
-        bbox=source["bbox"],
-        attribution=source["attribution"],
-        say=say,
-    )
+    which = {name: source[name] for name in ("layer", "crs", "tunnels", "bbox", "attribution")}
+    return read_roads(source[given], which=source["kinds"], **which, say=say)
 
 
 def _fetch(source: dict[str, Any], given: str, say: Say) -> Roads:
@@ -230,11 +222,10 @@ def _fetch(source: dict[str, Any], given: str, say: Say) -> Roads:
     from roadgeo.sources.overpass import FetchOptions
     from roadgeo.sources.roads import fetch_roads
 
-    options = replace(FetchOptions(), date=source["date"], cache=not source["no_cache"])
     servers = {key: source[key] for key in ("overpass_url", "nominatim_url") if source[key]}
-    options = replace(options, **servers)
-    where = {given: source[given]}
-    return fetch_roads(**where, which=source["kinds"], tunnels=source["tunnels"], options=options, say=say)
+    options = replace(FetchOptions(), date=source["date"], cache=not source["no_cache"], **servers)
+    where = {given: source[given], "which": source["kinds"], "tunnels": source["tunnels"]}
+    return fetch_roads(**where, options=options, say=say)
 
 
 def _read_plugin(source: dict[str, Any], given: str, say: Say) -> Roads:

@@ -65,22 +65,25 @@ QUERY_OPTIONS = {
 }
 
 
+#: Options of `ViewOptions` by their names there.
+_VIEW = {
+    "window_m": "window",
+    "gsd_m": "gsd",
+    "tilt_deg": "tilt",
+    "heading_deg": "heading",
+    "focal_px": "focal",
+    "road_width_m": "road_width",
+}
+
+
 def query_sets(options: Mapping[str, Any]) -> tuple[tuple[SimulationOptions, int], ...]:
     """Turn the options into sets of queries, one per noise model, and one of mirrored masks where some are wanted."""
     from roadgeo.evaluation.noise import NOISE_MODELS
     from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 
     fewest, most = options["intersections"]
-    view = ViewOptions(
-        size_px=(options["size"], options["size"]),
-        window_m=options["window"],
-        gsd_m=options["gsd"],
-        tilt_deg=options["tilt"],
-        heading_deg=options["heading"],
-        focal_px=options["focal"],
-        intersections=(int(fewest), int(most)),
-        road_width_m=options["road_width"],
-    )
+    given: dict[str, Any] = {field: options[name] for field, name in _VIEW.items()}
+    view = ViewOptions((options["size"],) * 2, intersections=(int(fewest), int(most)), **given)
     noise, seed, count = options["noise"], options["seed"], options["count"] or 40
     sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count) for name in dict.fromkeys(noise)]
     if options["mirrored"]:

@@ -220,16 +220,6 @@ def _options(given: dict[str, Any]) -> ServeOptions:
     host = given["host"] or "127.0.0.1"
     if host not in LOOPBACK and not token:
         raise click.UsageError("--host needs a token: set ROADGEO_TOKEN, or give --token-file FILE.")
-    return ServeOptions(
-        host=host,
-        port=given["port"],
-        token=token,
-        workers=given["jobs"],
-        waiting=given["waiting"],
-        max_bytes=given["max_bytes"],
-        max_pixels=given["max_pixels"],
-        time_limit_s=given["time_limit_s"],
-        connections=given["jobs"] + given["waiting"] + 64,
-        basemap=given["basemap"],
-        basemap_attribution=given["basemap_attribution"],
-    )
+    alike = ("port", "waiting", "max_bytes", "max_pixels", "time_limit_s", "basemap", "basemap_attribution")
+    limits = {name: given[name] for name in alike} | {"connections": given["jobs"] + given["waiting"] + 64}
+    return ServeOptions(host=host, token=token, workers=given["jobs"], **limits)

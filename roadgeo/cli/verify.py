@@ -61,8 +61,6 @@ def verify_command(
     images: tuple[str, ...],
     out_dir: str,
     as_json: bool,
-    fix: bool,
-    in_place: bool,
     jobs: int,
     quiet: bool,
     verbose: bool,
@@ -105,7 +103,7 @@ def verify_command(
     settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
     opened = open_references(settings.references, print_steps(quiet))  # their errors are printed once
     compile_once(quiet)
-    if fix or given["report"] or len(tasks) > 1:
+    if given["fix"] or given["report"] or len(tasks) > 1:
         make_folder(out_dir)
     results: list[Verified] = []
     with count_up(len(tasks), quiet, as_json) as count:
@@ -114,7 +112,7 @@ def verify_command(
             count(verified.verdict)
             stem = Path(out_dir) / task.stem
             pages = [_write_page(verified, task.mask, stem, opened, settings)] if given["report"] else []
-            files = [*pages, *_correct(verified, Path(task.mask), stem, fix, in_place)]
+            files = [*pages, *_correct(verified, Path(task.mask), stem, given["fix"], given["in_place"])]
             _report(verified, files, as_json, quiet, verbose)
     documents = [verified.document for verified in results]
     counts = Counter(verified.verdict for verified in results)
