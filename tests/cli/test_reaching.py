@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import pytest
 
-from roadgeo.cli import cli, queries
+from roadgeo.cli import cli, queries, shards
 from roadgeo.cli.locate import locate_command
 from roadgeo.cli.options import read_options
 from roadgeo.cli.track import _frame_options, track_command
@@ -33,15 +33,18 @@ ALL = commands(cli)
 
 
 def read_in(module: str) -> set[str]:
-    """Names and texts that a module loads, and those that helpers of `simulate` and `evaluate` take."""
+    """Names and texts that a module loads, and those that helpers of several commands take."""
     tree = ast.parse(Path(inspect.getfile(sys.modules[module])).read_text())
-    if "roadgeo.cli.queries" in ast.unparse(tree):
-        tree.body += ast.parse(Path(inspect.getfile(queries)).read_text()).body
+    for helper in (queries, shards):
+        if f"{helper.__name__} import" in ast.unparse(tree):
+            tree.body += ast.parse(Path(inspect.getfile(helper)).read_text()).body
     loaded = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     taken = loaded | texts
     if "read_options" in loaded:
         taken |= {field.name for field in fields(ReadOptions)} | {"allow_mirror"}
+    if "make_cluster" in loaded:
+        taken |= {"engine", "scheduler", "divide_map"}
     if "hinted" in loaded:
         taken |= {hint.goes_to for hint in HINTS.values()}
     return taken
