@@ -1,4 +1,4 @@
-"""Errors, named by what failed.
+"""Errors, named by what failed, and the codes of reasons.
 
 A message holds what was wrong, what was got, what was expected and what to do, on one line. A mask that merely is not
 found on the map is no error: it is a `Location` with a reason.
@@ -6,6 +6,7 @@ found on the map is no error: it is a `Location` with a reason.
 
 import re
 import sys
+from enum import StrEnum
 from pathlib import Path
 
 from roadgeo._text import visible
@@ -21,6 +22,7 @@ __all__ = [
     "OutputError",
     "PhotographError",
     "PluginError",
+    "Reason",
     "RoadSourceError",
     "RoadgeoError",
     "how_to_install",
@@ -88,6 +90,42 @@ class OutputError(RoadgeoError):
 
 class PluginError(RoadgeoError):
     """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
+
+
+class Reason(StrEnum):
+    """Why a mask was located, or not: a code for programs, beside the sentence for people."""
+
+    LOCATED = "located"
+    #: The user took one of the places that a refusal listed.
+    CHOSEN = "chosen"
+    #: Two places fit almost equally; or two looks at one scene find two.
+    TWO_PLACES = "two_places"
+    TWO_LOOKS = "two_looks"
+    #: The middle is uncertain by much of the frame, as along a road that is all that is seen.
+    HALF_A_PLACE = "half_a_place"
+    #: The mask shows too few intersections, or hardly a road.
+    FEW_INTERSECTIONS = "few_intersections"
+    FEW_ROADS = "few_roads"
+    #: The map has too few around the place that was given.
+    FEW_NEAR = "few_near"
+    #: Stopped before everything was tried.
+    TIME_LIMIT = "time_limit"
+    #: No place explains clearly more than others do.
+    NOTHING_STANDS_OUT = "nothing_stands_out"
+    #: Something did, but not by enough for all the looks that were taken.
+    TOO_MANY_LOOKS = "too_many_looks"
+    #: Turned over, left to right, it would be located.
+    MIRRORED = "mirrored"
+    #: The mask, the photograph or what goes with it cannot be read or used; a result cannot be written.
+    INVALID = "invalid"
+    NOT_WRITTEN = "not_written"
+    #: There is no reference, or none that can be used.
+    NO_REFERENCE = "no_reference"
+    #: A segmenter or another plugin failed.
+    PLUGIN = "plugin"
+    MEMORY = "memory"
+    #: The fault is roadgeo's own.
+    FAULT = "fault"
 
 
 def name_package(error: ModuleNotFoundError) -> MissingPackageError | None:

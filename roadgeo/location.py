@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -12,11 +10,12 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import FloatArray
-from roadgeo.errors import NotLocatedError, name_package
+from roadgeo.errors import NotLocatedError, Reason, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.uncertainty import CenterError
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
@@ -40,67 +39,6 @@ __all__ = [
 SCHEMA = "roadgeo.location/1"
 
 Status = Literal["located", "ambiguous", "not_located", "chosen", "error"]
-
-
-class Reason(StrEnum):
-    """Why a mask was located, or not: a code for programs, beside the sentence for people."""
-
-    LOCATED = "located"
-    #: The user took one of the places that a refusal listed.
-    CHOSEN = "chosen"
-    #: Two places fit almost equally; or two looks at one scene find two.
-    TWO_PLACES = "two_places"
-    TWO_LOOKS = "two_looks"
-    #: The middle is uncertain by much of the frame, as along a road that is all that is seen.
-    HALF_A_PLACE = "half_a_place"
-    #: The mask shows too few intersections, or hardly a road.
-    FEW_INTERSECTIONS = "few_intersections"
-    FEW_ROADS = "few_roads"
-    #: The map has too few around the place that was given.
-    FEW_NEAR = "few_near"
-    #: Stopped before everything was tried.
-    TIME_LIMIT = "time_limit"
-    #: No place explains clearly more than others do.
-    NOTHING_STANDS_OUT = "nothing_stands_out"
-    #: Something did, but not by enough for all the looks that were taken.
-    TOO_MANY_LOOKS = "too_many_looks"
-    #: Turned over, left to right, it would be located.
-    MIRRORED = "mirrored"
-    #: The mask, the photograph or what goes with it cannot be read or used; a result cannot be written.
-    INVALID = "invalid"
-    NOT_WRITTEN = "not_written"
-    #: There is no reference, or none that can be used.
-    NO_REFERENCE = "no_reference"
-    #: A segmenter or another plugin failed.
-    PLUGIN = "plugin"
-    MEMORY = "memory"
-    #: The fault is roadgeo's own.
-    FAULT = "fault"
-
-
-class CenterError(NamedTuple):
-    """How far the middle of a frame may be off.
-
-    Attributes
-    ----------
-    along_m, across_m : float
-        Greatest standard deviation of all directions, and that at right angles to it.
-    azimuth_deg : float
-        Direction of the greatest, clockwise from the north of the CRS, 0 to 180.
-    """
-
-    along_m: float
-    across_m: float
-    azimuth_deg: float
-
-    @classmethod
-    def of(cls, covariance: FloatArray) -> CenterError:
-        """Compute it from the covariance (8, 8) of the corners' x and y: the middle is taken for their mean."""
-        mean = np.tile(np.eye(2), 4) / 4.0
-        (across, along), axes = np.linalg.eigh(mean @ covariance @ mean.T)
-        east, north = axes[:, 1]
-        azimuth = math.degrees(math.atan2(east, north)) % 180.0
-        return cls(math.sqrt(max(along, 0.0)), math.sqrt(max(across, 0.0)), azimuth)
 
 
 class ErrorRate(NamedTuple):
@@ -208,13 +146,10 @@ class Camera:
         sigma = np.sqrt(np.diag(self.covariance)).tolist()
         names = ("x_m", "y_m", "height_m", "heading_deg", "pitch_deg", "roll_deg")
         known = {name: getattr(self, name) for name in ("x", "y", "lon", "lat", *names[2:])}
+        plain = ("ground_m", "ground_spread_m", "altitude_m", "focal_px", "source")
         return {
             **known,
-            "ground_m": self.ground_m,
-            "ground_spread_m": self.ground_spread_m,
-            "altitude_m": self.altitude_m,
-            "focal_px": self.focal_px,
-            "source": self.source,
+            **{name: getattr(self, name) for name in plain},
             "sigma": {**dict(zip(names, sigma, strict=True)), "focal_px": self.focal_sigma_px},
             "covariance": self.covariance.tolist(),
             "rotation": self.rotation.tolist(),
@@ -519,9 +454,6 @@ class Location:
     def to_dict(self) -> dict[str, Any]:
         """Plain values in the order of the schema, ready for `json.dumps`; without evidence and the mask's contents."""
 
-        def rows(array: FloatArray | None) -> list[Any] | None:
-            return None if array is None else array.tolist()
-
         def place(other: Place) -> dict[str, Any]:
             middle = {"x": other.x, "y": other.y, "lon": other.lon, "lat": other.lat}
             return {"center": middle, "log10_odds": other.log10_odds}
@@ -530,53 +462,42 @@ class Location:
             ring = other.footprint_lonlat
             return {**place(other), "footprint_lonlat": None if ring is None else [list(corner) for corner in ring]}
 
-        center = self.center
-        rmse_m, rmse_px = self.rmse() or (None, None)
-        # The order in which people read it: the query, the place, its certainty, the cost.
-        return {
+        center, exact = self.center, not np.isnan(self.lonlat_accuracy_m)
+        made = {
             "schema": SCHEMA,
             "version": __version__,
-            "query": self.query,
-            "status": self.status,
-            "reason": self.reason,
             "reason_code": self.reason_code.value,
-            "reference": self.reference,
             "reference_digest": self.reference_digest or None,
-            "attribution": self.attribution,
-            "options": self.options,
             "command": self.command or None,
-            "crs": self.crs,
-            "size": None if self.size is None else list(self.size),
-            "homography": rows(self.homography),
-            "footprint": rows(self.footprint),
-            "footprint_lonlat": rows(self.footprint_lonlat),
             "center": None if center is None else place(center)["center"],
-            "gsd_m": self.gsd_m,
-            "rotation_deg": self.rotation_deg,
-            "tilt_deg": self.tilt_deg,
-            "tilt_source": self.tilt_source,
-            "fitted": self.fitted,
             "lens_k1": None if center is None else self.lens_k1,
-            "corner_sigma_m": rows(self.corner_sigma_m),
-            "corner_covariance_m2": rows(self.corner_covariance_m2),
-            "center_error": None if self.center_error is None else self.center_error._asdict(),
-            "lonlat_sigma_m": rows(self.lonlat_sigma_m),
-            "lonlat_accuracy_m": None if center is None or np.isnan(self.lonlat_accuracy_m) else self.lonlat_accuracy_m,
-            "camera": None if self.camera is None else self.camera.to_dict(),
-            "mirrored": self.mirrored,
-            "query_to_pixel": rows(self.query_to_pixel),
-            "part_read": self.part_read,
-            "stated_offset_m": self.stated_offset_m,
-            "rmse_m": rmse_m,
-            "rmse_px": rmse_px,
-            "n_intersections": self.n_intersections,
-            "n_matched": self.n_matched,
-            "inlier_ratio": self.inlier_ratio,
-            "log10_odds": self.log10_odds,
-            "error_rate": None if self.error_rate is None else self.error_rate._asdict(),
+            "lonlat_accuracy_m": self.lonlat_accuracy_m if center is not None and exact else None,
+            **dict(zip(("rmse_m", "rmse_px"), self.rmse() or (None, None), strict=True)),
             "runner_up": None if self.runner_up is None else place(self.runner_up),
             "alternatives": [framed(alternative) for alternative in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},
             "stats": asdict(self.stats),
-            "stopped": self.stopped,
         }
+        return {name: made[name] if name in made else _plain(getattr(self, name)) for name in _ORDER}
+
+
+#: The keys of `Location.to_dict` in the order in which people read them: the query, the place, its certainty, the cost.
+_ORDER = (
+    *("schema", "version", "query", "status", "reason", "reason_code", "reference", "reference_digest", "attribution"),
+    *("options", "command", "crs", "size", "homography", "footprint", "footprint_lonlat", "center", "gsd_m"),
+    *("rotation_deg", "tilt_deg", "tilt_source", "fitted", "lens_k1", "corner_sigma_m", "corner_covariance_m2"),
+    *("center_error", "lonlat_sigma_m", "lonlat_accuracy_m", "camera", "mirrored", "query_to_pixel"),
+    *("part_read", "stated_offset_m", "rmse_m", "rmse_px", "n_intersections", "n_matched", "inlier_ratio", "log10_odds"),
+    *("error_rate", "runner_up", "alternatives", "seconds", "stats", "stopped"),
+)
+
+
+def _plain(value: Any) -> Any:
+    """Return a field as plain values."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Camera):
+        return value.to_dict()
+    if isinstance(value, CenterError | ErrorRate):
+        return value._asdict()
+    return list(value) if isinstance(value, tuple) else value

@@ -12,7 +12,14 @@ import roadgeo
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.workflows import build_reference
 
-MODULES = ("roadgeo", "roadgeo.api", "roadgeo.workflows", "roadgeo.reference.reference", "roadgeo.outputs.schemas")
+MODULES = (
+    "roadgeo",
+    "roadgeo.api",
+    "roadgeo.running.answers",
+    "roadgeo.workflows",
+    "roadgeo.reference.reference",
+    "roadgeo.outputs.schemas",
+)
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,11 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.roads.coverage import coverage
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, Intersections, find_intersections
 from roadgeo.roads.labels import label_roads
-from roadgeo.roads.simplification import SimplifyOptions, coverage, planarize, simplify
+from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
 from roadgeo.storage.memory import give_back_memory
 
 __all__ = ["NetworkOptions", "RoadNetwork", "as_stored", "build_network"]

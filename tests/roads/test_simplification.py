@@ -9,12 +9,12 @@ from shapely.geometry import LineString, MultiLineString
 from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import parallel_roads
 from roadgeo.kernels import simplification as kernels
+from roadgeo.roads.coverage import coverage
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.simplification import (
     SimplifyOptions,
     _keep_edges,
     _walk_faces,
-    coverage,
     cut_edges,
     fuse_twins,
     narrow_faces,
