@@ -19,6 +19,7 @@ from roadgeo.matching.evidence import Evidence, statement_px
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
+from roadgeo.matching.picture import Picture
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadSearch
 from roadgeo.matching.scene import AGREE_DEG, Scene
@@ -261,6 +262,11 @@ class TripleEstimator:
                 return
         self._weigh(model)
 
+    def refine_whole(self, model: Hypothesis) -> None:
+        """Refine a verified hypothesis with all points, which may have been given up before."""
+        if model.refined is not None and model.refined.lens_k1 == 0.0:
+            self._converge(model, None, -math.inf)
+
     def _weigh(self, model: Hypothesis) -> None:
         """Weigh a hypothesis, and, if it leads all other verified places, the best place nearby."""
         self._charge(model)
@@ -304,6 +310,10 @@ class TripleEstimator:
         self._weigh(seen)
         if seen.log10_odds >= model.log10_odds and seen.found is not None and seen.found.forward >= agreeing.forward:
             model.take(seen)
+
+    def picture(self, model: Hypothesis, gsd_m: float) -> Picture:
+        """Return the picture as a hypothesis straightens it, to be weighed at this many metres per pixel."""
+        return Picture(self.scene_of(model), self.index, gsd_m)
 
     def scene_of(self, model: Hypothesis) -> Scene:
         """Return the scene without the distortion that a hypothesis found."""

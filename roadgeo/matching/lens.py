@@ -151,6 +151,9 @@ def straighten_scene(scene: Scene, k1: float) -> Scene:
     cells = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1) * scene.field_scale
     seen = (Lens.of(k1, scene.size).bend(cells) / scene.field_scale - 0.5).astype(np.float32)
     field = cv2.remap(scene.field, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    soft = scene.probability
+    if soft is not None:
+        soft = np.asarray(cv2.remap(soft, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR), np.float32)
     observed = cv2.remap(scene.observed.astype(np.uint8), seen[..., 0], seen[..., 1], cv2.INTER_NEAREST)
     return replace(
         scene,
@@ -162,4 +165,5 @@ def straighten_scene(scene: Scene, k1: float) -> Scene:
         dense_directions=lens.straighten_directions(scene.dense_points, scene.dense_directions),
         field=np.asarray(field, np.float32),
         observed=observed > 0,
+        probability=soft,
     )

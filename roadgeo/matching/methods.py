@@ -21,9 +21,11 @@ from roadgeo.matching.evidence import agreement, statement_px
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
+from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs, well_fitted
 from roadgeo.matching.parts import Part, Whole, same_within_m
+from roadgeo.matching.picture import Picture
 from roadgeo.matching.rivals import Rivals, Standing
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
@@ -253,6 +255,8 @@ def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], r
         found.events.result = search
     fits = () if standing is None else _fits(estimator, standing)
     further = () if standing is None else _further(estimator, standing, N_PLACES - len(fits))
+    if estimator.scene.probability is not None and fits:
+        fits, further = _by_picture(estimator, fits, further)
     work_ms = round(1000 * estimator.work / scale)
     counts = estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified
     return replace(
@@ -297,6 +301,23 @@ def _further(estimator: TripleEstimator, standing: Standing, most: int) -> tuple
         if fit is not None:  # how far its corners may be off was not measured
             further.append(replace(fit, corner_sigma_m=None, corner_covariance_m2=None, statement_px=counted_px))
     return tuple(further)
+
+
+def _by_picture(
+    estimator: TripleEstimator, fits: Sequence[Fit], further: Sequence[Fit]
+) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:
+    """Return places with their likelihoods by the picture, so that places on several maps compare by it."""
+    scene = estimator.scene
+    gsd_m, lead = sampling(fits[0].matrix, scene.size), min(-fits[0].log10_odds, 0.0)
+
+    def weigh(fit: Fit) -> Fit:
+        straight = straighten_scene(scene, fit.lens_k1) if fit.lens_k1 else scene
+        picture = Picture(straight, estimator.index, gsd_m)
+        return replace(fit, log10_likelihood=picture.weigh(fit.matrix), statement_px=picture.statement_px)
+
+    best, *others = map(weigh, (*fits, *further))
+    others = [replace(fit, log10_odds=min(fit.log10_likelihood - best.log10_likelihood, lead)) for fit in others]
+    return (best, *others[: len(fits) - 1]), tuple(others[len(fits) - 1 :])
 
 
 def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | None:

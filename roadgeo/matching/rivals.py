@@ -7,6 +7,9 @@ that explains more becomes the best place, and is compared in its turn.
 
 The lead has two parts: the pieces of the query that favour the place over the best rival (see
 `Evidence.compared_with`), and the gap between its likelihood and the rivals' (`log10_gap`).
+
+Where traced roads do not decide, the picture does (see `picture`): a soft one shows more than the roads that were
+traced in it. Its rivals are the places that were met, and all shifts and turns of the place around.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence, match_intersections
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.picture import Peak, Picture
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
@@ -62,6 +66,11 @@ N_LAID = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
+#: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
+#: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
+_REACHES_M, _CLEAR, _PEAKS, _WEIGHED = (1000.0, 4000.0), 12.0, 12, 4
+#: The picture's places are different if their middles are further apart than this, metres and pixels.
+_BESIDE_M, _BESIDE_PX = 30.0, 8.0
 #: Streets around a place, and the blocks beside it.
 _AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
 _NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
@@ -115,7 +124,7 @@ class Rivals:
         best = max(parts, key=self._explained)
         if max((model.log10_odds for model in self.estimators[best].verified), default=-math.inf) < self.needed:
             return None  # a place that was met is already too good a rival
-        standing = self.standing(best)
+        standing = self._by_roads(best)
         return best if standing is not None and standing.log10_lead >= 2.0 * self.needed else None
 
     def _explained(self, part: Search[Hypothesis]) -> float:
@@ -124,6 +133,60 @@ class Rivals:
 
     def standing(self, part: Search[Hypothesis]) -> Standing | None:
         """Compare the likeliest place of a part with its best rival; return None if no place was verified."""
+        by_roads, estimator = self._by_roads(part), self.estimators[part]
+        if by_roads is None or by_roads.log10_lead >= self.needed or time.perf_counter() > self._deadline:
+            return by_roads
+        started = time.perf_counter()
+        seen = self._by_picture(estimator)
+        part.seconds += time.perf_counter() - started
+        if seen.log10_lead <= by_roads.log10_lead:
+            return by_roads
+        if estimator.scene.probability is not None or seen.rival is None:
+            return seen
+        scene, gsd_m = estimator.scene_of(seen.model), sampling(seen.model.matrix, estimator.scene.size)
+        return seen._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(seen.rival))
+
+    @property
+    def _by_chance(self) -> float:
+        """Score that a place loses: the larger the map, the more places may lead all places around them by chance."""
+        return 2.0 * math.log10(larger(self.ledger.n_reference))
+
+    def _by_picture(self, estimator: TripleEstimator) -> Standing:
+        """Compare the place that the picture favours with its best rival."""
+        ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)[:_N_KNOWN]
+        gsd_m = sampling(ranked[0].matrix, estimator.scene.size)
+        best = max(ranked, key=lambda model: estimator.picture(model, gsd_m).weigh(model.matrix))
+        for _ in range(_MOST_TURNS):
+            standing = self._seen(estimator, best, ranked)
+            if standing.rival is None or not standing.is_beaten:
+                break
+            best = self._take(estimator, standing.rival, ranked)
+        return standing
+
+    def _seen(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
+        """Compare a place with those that were met, and with those around, by the picture."""
+        estimator.refine_whole(best)
+        picture = estimator.picture(best, sampling(best.matrix, estimator.scene.size))
+        apart_m, middle = max(_BESIDE_M, _BESIDE_PX * picture.gsd_m), estimator.center(best)
+        others = [
+            Peak(estimator.picture(model, picture.gsd_m).weigh(model.matrix), model.matrix)
+            for model in ranked
+            if math.dist(estimator.center(model), middle) > apart_m
+        ]
+        worth, lead, rival = picture.weigh(best.matrix), math.inf, None
+        for reach_m in _REACHES_M:
+            if reach_m > _REACHES_M[0] and not _WORTH_LOOKING * self.needed <= lead < _CLEAR:
+                break
+            others += _around(picture, best.matrix, reach_m, apart_m, estimator)
+            rival = max(others, key=lambda other: other.worth, default=None)
+            lead = worth - max(0.0 if rival is None else rival.worth, 0.0)
+        lead -= self._by_chance
+        if rival is None:
+            return Standing(best, None, lead, worth)
+        return Standing(best, rival.matrix, lead, worth, rival.worth)
+
+    def _by_roads(self, part: Search[Hypothesis]) -> Standing | None:
+        """Compare the likeliest place of a part with its best rival, by traced roads."""
         estimator = self.estimators[part]
         ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)
         if not ranked:
@@ -154,8 +217,7 @@ class Rivals:
         evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m, compare = _APART * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
-        # The larger the map, the more places may lead all places around them by chance.
-        against = 2.0 * math.log10(larger(self.ledger.n_reference)) + doubt
+        against = self._by_chance + doubt
 
         def is_rival(other: Other) -> bool:
             return bool(
@@ -202,6 +264,23 @@ class Rivals:
         model = Hypothesis.at(matrix, estimator.scene, estimator.index)
         estimator.score(model)
         return model
+
+
+def _around(
+    picture: Picture, matrix: FloatArray, reach_m: float, apart_m: float, estimator: TripleEstimator
+) -> list[Peak]:
+    """Return the likeliest other places around a place (3, 3), shifted or turned, that agree with the hints."""
+    center = Homography(matrix).everywhere(picture.scene.center)
+    if estimator.near is not None:
+        reach_m = min(reach_m, 2.0 * estimator.near[2])
+    found: list[Peak] = []
+    for peak in picture.correlate(matrix, reach_m, _TURNS_DEG, _PEAKS, apart_m):
+        away_m = np.hypot(*(Homography(peak.matrix).everywhere(picture.scene.center) - center))
+        if (peak.turn_deg != 0.0 or away_m > apart_m) and estimator.may_be(peak.matrix):
+            found.append(picture.settle(peak))
+        if len(found) == _WEIGHED:
+            break
+    return found
 
 
 def similar_places(

@@ -79,6 +79,8 @@ class Scene:
     field_scale : float
         Pixels per cell.
     observed : (h, w) bool
+    probability : (h, w) float32 or None
+        Mean probability of road of each cell, where the mask was made of such probabilities.
     road_width_px : float
         Usual width of the mask's roads; 0: not known.
     """
@@ -97,6 +99,7 @@ class Scene:
     field: Float32Array
     field_scale: float
     observed: BoolArray
+    probability: Float32Array | None = None
     road_width_px: float = 0.0
 
     @cached_property
@@ -212,7 +215,14 @@ def prepare_scene(
         field=field,
         field_scale=scale,
         observed=seen,
+        probability=None if probability is None else _reduced(probability, cells),
     )
+
+
+def _reduced(probability: AnyArray, cells: tuple[int, int]) -> Float32Array:
+    """Return the mean probability of road of each cell (h, w) of the reduced frame, 0 to 1."""
+    known = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability).astype(np.float32)
+    return np.asarray(cv2.resize(known, cells[::-1], interpolation=cv2.INTER_AREA) / PROBABILITY_SURE, np.float32)
 
 
 #: Lengths in road widths: roads nearer to each other are a single road, intersections nearer a single intersection;

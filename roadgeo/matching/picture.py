@@ -1,0 +1,265 @@
+"""The likelihood of a place by the picture: the probability of road under the map's roads, and beside them.
+
+A cell of the frame shows p, the probability of road; pi is its mean over the picture. Against the picture's own
+distribution, road shows p with the ratio s = p / pi, other ground with b = (1 - p) / (1 - pi). Under a place H
+
+    log L(H) = sum over the map's roads     log[ (1 - m) s + m b ]
+             + sum over the other ground    log[ (1 - f pi) b + f pi s ]
+
+with m the share of the map's roads that the picture lacks, and f the density of roads that the map lacks, in parts of
+the picture's own. Both are marginalised over a small grid. A place that says nothing has log L = 0. A drawn mask is a
+picture of two probabilities. Neighbouring cells agree together, so `_STATEMENT_M` metres of road count once.
+
+All shifts of a place are compared at once: the rectified picture is correlated with the map by FFT.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, Float32Array, FloatArray
+from roadgeo.geometry.camera import sampling
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["Peak", "Picture", "shifted"]
+
+#: Grid of the marginalised shares: of the map's roads that are missing, and the density of false roads.
+_MISSING = np.array([0.05, 0.15, 0.3, 0.5, 0.75])
+_FALSE = np.array([0.1, 0.3, 0.6, 1.0])
+#: Levels of log odds: this number for each nat, up to this log odds either way.
+_FINE, _SUREST = 16.0, 5.5
+#: Probabilities of a drawn mask on its roads and elsewhere; half the width of a road, and how far its edge is blurred.
+_DRAWN, _HALF_ROAD_M, _BLUR_M = (0.98, 0.02), 5.0, 1.5
+#: Width of the map's roads, as they are drawn, metres.
+_ROAD_M = 8.0
+#: This length of the map's roads counts as one independent statement, metres, but never fewer than a fifth as many
+#: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
+#: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
+_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 280.0, 450.0, 0.2
+#: Pixel sizes, a factor apart, at which a drawn mask's roads are as wide as a road.
+_GSD_STEP = 1.05
+#: Steps by which a place is moved, cells.
+_STEPS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+
+
+class Peak(NamedTuple):
+    """A place (3, 3) where the picture agrees with the map, and its log10 likelihood."""
+
+    worth: float
+    matrix: FloatArray
+    turn_deg: float = 0.0
+
+
+class Ground(NamedTuple):
+    """The map's roads as a raster, rows northwards: the share of each cell (rows, columns), its corner, its cell."""
+
+    roads: Float32Array
+    corner: FloatArray
+    cell_m: float
+
+
+class _Levels(NamedTuple):
+    """The picture in levels of log odds (h, w), pixels per cell, its neutral level, and log ratios (share, level)."""
+
+    cells: AnyArray
+    scale: float
+    neutral: int
+    on: FloatArray
+    off: FloatArray
+
+
+class Picture:
+    """Weighs places of one scene on one map, all with the same yardstick; see `Evidence` for `gsd_m`."""
+
+    def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
+        self.scene, self.index, self.gsd_m = scene, index, gsd_m
+        statement_m = _DRAWN_STATEMENT_M if scene.probability is None else _STATEMENT_M
+        self.statement_px = statement_m * max(1.0 / gsd_m, _STATEMENT_PX)
+
+    def weigh(self, matrix: FloatArray, ground: Ground | None = None) -> float:
+        """Return log10 L of a place, query plane to reference plane (3, 3)."""
+        nats = self._nats(matrix, ground)
+        most = float(nats.max())
+        return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
+
+    def _nats(self, matrix: FloatArray, ground: Ground | None = None) -> FloatArray:
+        """Return log L by (missing, false)."""
+        gsd_m = sampling(matrix, self.scene.size)
+        ground = ground or self._around(matrix, fine_cell_m(gsd_m), 0.0)
+        rectified = self._rectify(matrix, ground)
+        if rectified is None:
+            return np.zeros((len(_MISSING), len(_FALSE)))
+        levels, template, (column, row) = rectified
+        n, (rows, columns) = levels.on.shape[1], ground.roads.shape
+        top, left = max(row, 0), max(column, 0)
+        bottom, right = min(row + template.shape[0], rows), min(column + template.shape[1], columns)
+        whole, under = np.bincount(template.ravel(), minlength=n), np.zeros(n)
+        if top < bottom and left < right:
+            cut = template[top - row : bottom - row, left - column : right - column]
+            under += np.bincount(cut.ravel(), ground.roads[top:bottom, left:right].ravel(), n)
+        unit = _length_px(ground.cell_m, gsd_m) / self.statement_px
+        return np.asarray(unit * ((levels.on @ under)[:, None] + levels.off @ (whole - under)))
+
+    def settle(self, peak: Peak) -> Peak:
+        """Move a place found on coarse cells by steps of a fine cell to where it is likeliest."""
+        cell_m = fine_cell_m(sampling(peak.matrix, self.scene.size))
+        ground = self._around(peak.matrix, cell_m, 5.0 * cell_m)
+        best = Peak(self.weigh(peak.matrix, ground), peak.matrix, peak.turn_deg)
+        for _ in range(4):
+            moved = [shifted(best.matrix, *step) for step in cell_m * _STEPS]
+            better = max((Peak(self.weigh(m, ground), m, peak.turn_deg) for m in moved), key=lambda peak: peak.worth)
+            if better.worth <= best.worth:
+                break
+            best = better
+        return best
+
+    def correlate(
+        self, matrix: FloatArray, reach_m: float, turns_deg: Sequence[float], most: int, apart_m: float
+    ) -> list[Peak]:
+        """Return places around a place where the picture correlates with the map, the best first.
+
+        Parameters
+        ----------
+        matrix : (3, 3) float64
+            Query plane to reference plane: the picture is rectified by it.
+        reach_m : float
+            Greatest shift, east and north.
+        turns_deg : sequence of float
+            By which the place is turned about its middle.
+        most : int
+            Number of places for each turn.
+        apart_m : float
+            Least distance between two places of a turn.
+        """
+        scene, gsd_m = self.scene, sampling(matrix, self.scene.size)
+        missing, false = divmod(int(self._nats(matrix).argmax()), len(_FALSE))
+        center, corners = (Homography(matrix).everywhere(points) for points in (scene.center, scene.corners))
+        cell_m = max(_ROAD_M, 1.5 * gsd_m)
+        radius_m = float(np.hypot(*(corners - center).T).max()) + 2.0 * cell_m
+        side = cv2.getOptimalDFTSize(math.ceil(2.0 * (reach_m + radius_m) / cell_m))
+        low = center - side * cell_m / 2.0
+        ground = draw_roads(self.index, low, low + (side - 0.5) * cell_m, cell_m)
+        spectrum = cv2.dft(ground.roads)
+        unit = _length_px(cell_m, gsd_m) / self.statement_px / math.log(10.0)
+        found: list[Peak] = []
+        reach, apart = int(reach_m / cell_m), max(int(apart_m / cell_m), 1)
+        for turn_deg in turns_deg:
+            turned = rotate_about(center, turn_deg) @ matrix
+            rectified = self._rectify(turned, ground)
+            if rectified is None:
+                continue
+            levels, template, (column, row) = rectified
+            padded = np.zeros_like(ground.roads)
+            padded[: template.shape[0], : template.shape[1]] = (levels.on[missing] - levels.off[false])[template]
+            product = cv2.mulSpectrums(spectrum, cv2.dft(padded), 0, conjB=True)
+            sums = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+            top, left = max(row - reach, 0), max(column - reach, 0)
+            near = np.ascontiguousarray(sums[top : row + reach + 1, left : column + reach + 1])
+            peaks = near == cv2.dilate(near, np.ones((2 * apart + 1, 2 * apart + 1), np.uint8))
+            rows, columns = np.nonzero(peaks)
+            order = np.argsort(-near[rows, columns])[:most]
+            for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+                moved = shifted(turned, (c + left - column) * cell_m, (r + top - row) * cell_m)
+                found.append(Peak(float(near[r, c]) * unit, moved, turn_deg))
+        return sorted(found, key=lambda peak: -peak.worth)
+
+    def _around(self, matrix: FloatArray, cell_m: float, reach_m: float) -> Ground:
+        """Draw the map's roads around a place."""
+        places = Homography(matrix).everywhere(self.scene.corners)
+        return draw_roads(self.index, places.min(axis=0) - reach_m, places.max(axis=0) + reach_m, cell_m)
+
+    def _rectify(self, matrix: FloatArray, ground: Ground) -> tuple[_Levels, AnyArray, tuple[int, int]] | None:
+        """Return the picture's levels on the ground's grid, and its first cell's (column, row); None if too large."""
+        scene, cell_m = self.scene, ground.cell_m
+        gsd_m = sampling(matrix, scene.size)
+        places = (Homography(matrix).everywhere(scene.corners) - ground.corner) / cell_m
+        low = np.floor(places.min(axis=0)).astype(int) - 1
+        columns, rows = np.ceil(places.max(axis=0)).astype(int) + 1 - low
+        if not 0 < max(columns, rows) < 4000:
+            return None
+        step = 0 if scene.probability is not None else round(math.log(gsd_m) / math.log(_GSD_STEP))
+        levels = _levels(scene, step, max(1, int(cell_m / (gsd_m * scene.field_scale))))
+        to_cells = np.array([[1, 0, -ground.corner[0]], [0, 1, -ground.corner[1]], [0, 0, cell_m]]) / cell_m
+        to_cells[:2] -= np.outer(low, to_cells[2])
+        to_plane = np.diag([levels.scale, -levels.scale, 1.0])
+        half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        warp = np.linalg.inv(half) @ to_cells @ matrix @ to_plane @ half
+        template = cv2.warpPerspective(
+            levels.cells, warp, (int(columns), int(rows)), flags=cv2.INTER_LINEAR, borderValue=levels.neutral
+        )
+        return levels, template, (int(low[0]), int(low[1]))
+
+
+@lru_cache(maxsize=16)
+def _levels(scene: Scene, step: int, smaller: int) -> _Levels:
+    """Return the picture on cells `smaller` times coarser; a drawn mask's pixels are `_GSD_STEP ** step` metres."""
+    if scene.probability is None:
+        beyond = (scene.field * (scene.field_scale * _GSD_STEP**step) - _HALF_ROAD_M) / _BLUR_M
+        on, off = _DRAWN
+        probability: AnyArray = off + (on - off) / (1.0 + np.exp(np.clip(beyond, -30.0, 30.0)))
+    else:
+        probability = scene.probability
+    observed: AnyArray = scene.observed.astype(np.float32)
+    if smaller > 1:
+        height, width = (max(n // smaller, 1) for n in observed.shape)
+        cut = np.s_[: height * smaller, : width * smaller]
+        probability, observed = (
+            cv2.resize(cells[cut], (width, height), interpolation=cv2.INTER_AREA) for cells in (probability, observed)
+        )
+    seen = observed > 0.5
+    surest = 1.0 / (1.0 + math.exp(_SUREST))
+    usual = float(np.clip(probability[seen].mean() if seen.any() else 0.5, 2 * surest, 1.0 - 2 * surest))
+    odds = np.arange(int(2 * _SUREST * _FINE) + 1) / _FINE - _SUREST
+    p = 1.0 / (1.0 + np.exp(-odds))
+    road, other = p / usual, (1.0 - p) / (1.0 - usual)
+    neutral = round((math.log(usual / (1.0 - usual)) + _SUREST) * _FINE)
+    road, other = (np.where(np.arange(len(p)) == neutral, 1.0, ratio) for ratio in (road, other))
+    sure = np.clip(probability, surest, 1.0 - surest)
+    cells = np.round((np.log(sure / (1.0 - sure)) + _SUREST) * _FINE).astype(np.uint8)
+    missing, false = _MISSING[:, None], usual * _FALSE[:, None]
+    on_road = np.log((1.0 - missing) * road + missing * other)
+    elsewhere = np.log((1.0 - false) * other + false * road)
+    return _Levels(np.where(seen, cells, np.uint8(neutral)), scene.field_scale * smaller, neutral, on_road, elsewhere)
+
+
+def fine_cell_m(gsd_m: float) -> float:
+    """Return the cells by which places are weighed, metres."""
+    return max(_ROAD_M / 2.0, 1.5 * gsd_m)
+
+
+def _length_px(cell_m: float, gsd_m: float) -> float:
+    """Return the length of road in a cell that roads fill, pixels."""
+    return cell_m**2 / max(_ROAD_M, cell_m) / gsd_m
+
+
+def draw_roads(index: ReferenceIndex, low: FloatArray, high: FloatArray, cell_m: float) -> Ground:
+    """Draw the map's roads within a box of the plane."""
+    columns, rows = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
+    a, b = index.segments[:, :2], index.segments[:, 2:]
+    outside = (np.minimum(a, b) > high).any(axis=1) | (np.maximum(a, b) < low).any(axis=1)
+    lines = index.segments[~outside].astype(float).reshape(-1, 2, 2) - low
+    canvas = np.zeros((int(rows), int(columns)), np.uint8)
+    ends = np.round(lines / cell_m * 16.0 - 8.0).astype(np.int32)
+    cv2.polylines(canvas, list(ends), False, 255, max(1, round(_ROAD_M / cell_m)), cv2.LINE_AA, 4)
+    return Ground(canvas.astype(np.float32) / 255.0, low, cell_m)
+
+
+def rotate_about(center: FloatArray, turn_deg: float) -> FloatArray:
+    """Return the (3, 3) motion that turns the plane clockwise about a point (2,)."""
+    turn = -math.radians(turn_deg)
+    linear = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    to = center - linear @ center
+    return np.array([[*linear[0], to[0]], [*linear[1], to[1]], [0.0, 0.0, 1.0]])
+
+
+def shifted(matrix: FloatArray, east_m: float, north_m: float) -> FloatArray:
+    """Return a place (3, 3) moved on the map."""
+    return np.array([[1.0, 0.0, east_m], [0.0, 1.0, north_m], [0.0, 0.0, 1.0]]) @ matrix

@@ -1,0 +1,122 @@
+"""The likelihood of a place by the picture: what it favours, what says nothing, and the correlation of all shifts."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from worlds.scenes import Sight, camera, look, scene_of
+
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching import picture as pictures
+from roadgeo.matching.picture import Picture, shifted
+
+SIZE = (900, 700)
+TRUTH = camera((2000.0, 1900.0), SIZE, 1.0, heading_deg=15.0)
+
+
+@pytest.fixture(scope="module")
+def scene(town):
+    return scene_of(look(town[0], TRUTH, SIZE, Sight(1.0, missing=0.1, false=0.05)), SIZE)
+
+
+def soft(scene, strength=1.0, seed=0):
+    """The scene with a picture of probabilities: blurred, noisy, at most about as sure as `strength`."""
+    away_m = scene.field * scene.field_scale
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0.0, 1.0, away_m.shape).astype(np.float32), (0, 0), 3)
+    odds = strength * (4.0 - 0.5 * away_m + 4.0 * noise)
+    probability = np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -5.0, 5.0))), np.float32)
+    return replace(scene, probability=probability)
+
+
+def naive_weigh(picture, matrix):
+    """Add up the formula of the module cell by cell, as log10."""
+    scene, cell_m = picture.scene, 4.0
+    p, scale = scene.probability, scene.field_scale
+    usual = p.mean()
+    corners = Homography(matrix).everywhere(scene.corners)
+    low = corners.min(axis=0)
+    ground = pictures.draw_roads(picture.index, low, corners.max(axis=0), cell_m)
+    rows, columns = ground.roads.shape
+    back = Homography(np.linalg.inv(matrix))
+    middles = low + (np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) + 0.5) * cell_m
+    column, row = np.moveaxis(back.everywhere(middles.reshape(-1, 2)) * (1, -1) / scale - 0.5, -1, 0)
+    sampled = map_coordinates(p, [row, column], order=1, mode="nearest")
+    inside = (column >= 0) & (row >= 0) & (column <= p.shape[1] - 1) & (row <= p.shape[0] - 1)
+    road, other = sampled / usual, (1.0 - sampled) / (1.0 - usual)
+    share = ground.roads.ravel()
+    unit = cell_m / 2.0 / picture.statement_px  # roads are two cells wide, pixels are 1 m wide
+    nats = []
+    for m in (0.05, 0.15, 0.3, 0.5, 0.75):
+        for f in (0.1, 0.3, 0.6, 1.0):
+            on = np.log((1.0 - m) * road + m * other)
+            off = np.log((1.0 - f * usual) * other + f * usual * road)
+            nats.append(unit * (share * on + (1.0 - share) * off)[inside].sum())
+    return np.log10(np.mean(np.exp(nats)))
+
+
+def test_it_adds_up_what_the_formula_says_of_each_cell(town, scene):
+    picture = Picture(soft(scene), town[1], 1.0)
+    for east in (0.0, 40.0, 300.0):
+        matrix = shifted(TRUTH, east, 0.0)
+        assert picture.weigh(matrix) == pytest.approx(naive_weigh(picture, matrix), abs=0.4)
+
+
+@pytest.mark.parametrize("strength", [None, 1.0, 0.4], ids=["drawn", "soft", "weak"])
+def test_it_favours_the_place_its_scale_and_its_heading(town, scene, strength):
+    seen = scene if strength is None else soft(scene, strength)
+    picture = Picture(seen, town[1], 1.0)
+    there = picture.weigh(TRUTH)
+    assert there > 3.0
+    middle = Homography(TRUTH).everywhere(scene.center)
+    for factor in (0.6, 0.8, 1.25, 1.6):
+        scaled = np.array([[factor, 0.0, 0.0], [0.0, factor, 0.0], [0.0, 0.0, 1.0]])
+        about = shifted(scaled @ shifted(np.eye(3), *-middle), *middle) @ TRUTH
+        assert picture.weigh(about) < 0.3 * there
+    for turn_deg in (10.0, 90.0, 180.0):
+        assert picture.weigh(pictures.rotate_about(middle, turn_deg) @ TRUTH) < 0.3 * there
+
+
+def test_places_that_have_nothing_to_do_with_it_are_seldom_likely(town, scene):
+    """It is a likelihood ratio against the picture's own distribution: a tenfold one is met one time in ten at most."""
+    picture, rng = Picture(soft(scene), town[1], 1.0), np.random.default_rng(3)
+    elsewhere = [
+        camera(tuple(rng.uniform(700, 3300, 2)), SIZE, rng.uniform(0.6, 1.6), heading_deg=rng.uniform(100, 300))
+        for _ in range(60)
+    ]
+    worths = np.array([picture.weigh(matrix) for matrix in elsewhere])
+    assert (worths > 1.0).mean() <= 0.1
+
+
+def test_ground_that_was_not_observed_and_a_map_without_roads_say_nothing(town, scene):
+    seen = soft(scene)
+    nothing = replace(seen, observed=np.zeros_like(seen.observed))
+    assert Picture(nothing, town[1], 1.0).weigh(TRUTH) == pytest.approx(0.0, abs=1e-6)
+    away = Picture(seen, town[1], 1.0).weigh(shifted(TRUTH, 1e5, 0.0))
+    assert away <= 0.0
+    half = seen.observed.copy()
+    half[:, : half.shape[1] // 2] = False
+    blank = np.where(half, seen.probability, np.float32(0.9))
+    one, other = (Picture(replace(seen, observed=half, probability=p), town[1], 1.0) for p in (seen.probability, blank))
+    assert one.weigh(TRUTH) == pytest.approx(other.weigh(TRUTH), abs=0.05)
+
+
+def test_correlation_finds_the_place_among_all_shifts_and_turns(town, scene):
+    picture = Picture(soft(scene), town[1], 1.0)
+    middle = Homography(TRUTH).everywhere(scene.center)
+    start = pictures.rotate_about(middle, 90.0) @ shifted(TRUTH, 250.0, -120.0)
+    peaks = picture.correlate(start, 600.0, (0.0, 90.0, 180.0, 270.0), 5, 30.0)
+    assert [peak.worth for peak in peaks] == sorted((peak.worth for peak in peaks), reverse=True)
+    best = picture.settle(peaks[0])
+    assert peaks[0].turn_deg == 270.0
+    assert np.hypot(*(Homography(best.matrix).everywhere(scene.center) - middle)) < 6.0
+    assert best.worth == pytest.approx(picture.weigh(best.matrix), rel=0.01)
+    assert best.worth > 2.0 * picture.settle(peaks[1]).worth
+    assert best.worth >= picture.weigh(peaks[0].matrix)
+
+
+def test_a_frame_too_large_for_the_ground_weighs_nothing(town, scene):
+    picture = Picture(soft(scene), town[1], 1.0)
+    with np.errstate(all="ignore"):
+        assert picture.weigh(np.diag([400.0, 1.0, 1.0]) @ TRUTH) == 0.0
