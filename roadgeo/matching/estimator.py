@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -90,8 +91,11 @@ class TripleEstimator:
         events: Events | None = None,
         ledger: Ledger | None = None,
         sweeps: SharedSweeps | None = None,
+        whole: ReferenceIndex | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
+
+        `whole` is the map of which `index` is a part, near that circle.
 
         The `ledger` and the `sweeps` are shared with the estimators of other parts that are searched with this one.
         """
@@ -106,7 +110,7 @@ class TripleEstimator:
         self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
-        self.index = index
+        self.index, self.whole = index, whole or index
         self.options = options or MatchOptions()
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
@@ -114,6 +118,14 @@ class TripleEstimator:
         self._n_rounds, self._anchors = 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
+
+    @cached_property
+    def anywhere(self) -> TripleEstimator | None:
+        """The same on the whole map, whatever the hints on the place and the heading; None without these."""
+        camera = replace(self.options.camera, heading_deg=None, north_up=False)
+        if self.near is None and self.options.within is None and camera == self.options.camera:
+            return None
+        return TripleEstimator(self.scene, self.whole, replace(self.options, camera=camera, within=None))
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield the hypotheses that grew from each anchor; triples propose first, then roads.

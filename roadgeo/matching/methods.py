@@ -244,7 +244,7 @@ def _begin(
         part = _part(index, near[:2], reach)
         if len(part) == 0:
             return Found(index, events=events), None
-    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
+    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps, index)
     return Found(index, n_searched=len(part), events=events), estimator
 
 

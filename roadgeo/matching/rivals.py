@@ -66,6 +66,9 @@ N_LAID = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
+#: Where traced roads and the picture favour the same place, this part of the lesser lead counts as well: they are not
+#: independent.
+_AGREEING = 0.5
 #: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
 #: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
 _REACHES_M, _CLEAR, _PEAKS, _WEIGHED = (1000.0, 4000.0), 12.0, 12, 4
@@ -139,12 +142,13 @@ class Rivals:
         started = time.perf_counter()
         seen = self._by_picture(estimator)
         part.seconds += time.perf_counter() - started
-        if seen.log10_lead <= by_roads.log10_lead:
-            return by_roads
-        if estimator.scene.probability is not None or seen.rival is None:
-            return seen
-        scene, gsd_m = estimator.scene_of(seen.model), sampling(seen.model.matrix, estimator.scene.size)
-        return seen._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(seen.rival))
+        best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
+        if estimator.same(best.model, other.model):
+            best = best._replace(log10_lead=best.log10_lead + _AGREEING * max(other.log10_lead, 0.0))
+        if best.rival is None or best.model is by_roads.model or estimator.scene.probability is not None:
+            return best
+        scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
+        return best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
 
     @property
     def _by_chance(self) -> float:
@@ -203,6 +207,17 @@ class Rivals:
         return standing
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
+        """Compare a place with its rivals, and with those that hints exclude where it leads these too by more.
+
+        Hints leave few rivals, by which a gap is hard to judge: without them a place would lead by less.
+        """
+        standing, anywhere = self._compare_allowed(estimator, best, ranked), estimator.anywhere
+        if anywhere is None or standing.is_beaten or standing.log10_lead >= _CERTAIN:
+            return standing
+        free = self._compare_allowed(anywhere, best, [best])
+        return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
+
+    def _compare_allowed(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
         scene, matrix = estimator.scene_of(best), best.matrix
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
