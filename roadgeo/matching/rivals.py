@@ -66,8 +66,8 @@ N_LAID = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
-#: Where traced roads and the picture favour the same place, this part of the lesser lead counts as well: they are not
-#: independent.
+#: Where traced roads and the picture favour the same place, this part of the lesser lead counts as well, for they are
+#: not independent; where they favour different places, it counts against.
 _AGREEING = 0.5
 #: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
 #: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
@@ -137,15 +137,17 @@ class Rivals:
     def standing(self, part: Search[Hypothesis]) -> Standing | None:
         """Compare the likeliest place of a part with its best rival; return None if no place was verified."""
         by_roads, estimator = self._by_roads(part), self.estimators[part]
-        if by_roads is None or by_roads.log10_lead >= self.needed or time.perf_counter() > self._deadline:
+        is_soft = estimator.scene.probability is not None
+        clear = _CERTAIN if is_soft or estimator.anywhere is not None else self.needed
+        if by_roads is None or by_roads.log10_lead >= clear or time.perf_counter() > self._deadline:
             return by_roads
         started = time.perf_counter()
         seen = self._by_picture(estimator)
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
-        if estimator.same(best.model, other.model):
-            best = best._replace(log10_lead=best.log10_lead + _AGREEING * max(other.log10_lead, 0.0))
-        if best.rival is None or best.model is by_roads.model or estimator.scene.probability is not None:
+        agreeing = _AGREEING if estimator.same(best.model, other.model) else -1.0
+        best = best._replace(log10_lead=best.log10_lead + agreeing * max(other.log10_lead, 0.0))
+        if best.rival is None or best.model is by_roads.model or is_soft:
             return best
         scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
         return best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
