@@ -44,6 +44,8 @@ _ROAD_M = 8.0
 #: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
 #: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
 _STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 280.0, 450.0, 0.2
+#: Most cells along a side of the ground on which all shifts of a place are compared.
+_MOST_CELLS = 1100
 #: Pixel sizes, a factor apart, at which a drawn mask's roads are as wide as a road.
 _GSD_STEP = 1.05
 #: Steps by which a place is moved, cells.
@@ -93,7 +95,7 @@ class Picture:
     def _nats(self, matrix: FloatArray, ground: Ground | None = None) -> FloatArray:
         """Return log L by (missing, false)."""
         gsd_m = sampling(matrix, self.scene.size)
-        ground = ground or self._around(matrix, fine_cell_m(gsd_m), 0.0)
+        ground = ground or self._around(matrix, self._fine_cell_m(matrix), 0.0)
         rectified = self._rectify(matrix, ground)
         if rectified is None:
             return np.zeros((len(_MISSING), len(_FALSE)))
@@ -110,7 +112,7 @@ class Picture:
 
     def settle(self, peak: Peak) -> Peak:
         """Move a place found on coarse cells by steps of a fine cell to where it is likeliest."""
-        cell_m = fine_cell_m(sampling(peak.matrix, self.scene.size))
+        cell_m = self._fine_cell_m(peak.matrix)
         ground = self._around(peak.matrix, cell_m, 5.0 * cell_m)
         best = Peak(self.weigh(peak.matrix, ground), peak.matrix, peak.turn_deg)
         for _ in range(4):
@@ -142,8 +144,8 @@ class Picture:
         scene, gsd_m = self.scene, sampling(matrix, self.scene.size)
         missing, false = divmod(int(self._nats(matrix).argmax()), len(_FALSE))
         center, corners = (Homography(matrix).everywhere(points) for points in (scene.center, scene.corners))
-        cell_m = max(_ROAD_M, 1.5 * gsd_m)
-        radius_m = float(np.hypot(*(corners - center).T).max()) + 2.0 * cell_m
+        radius_m = float(np.hypot(*(corners - center).T).max())
+        cell_m = max(_ROAD_M, self._fine_cell_m(matrix), 2.0 * (reach_m + radius_m) / _MOST_CELLS)
         side = cv2.getOptimalDFTSize(math.ceil(2.0 * (reach_m + radius_m) / cell_m))
         low = center - side * cell_m / 2.0
         ground = draw_roads(self.index, low, low + (side - 0.5) * cell_m, cell_m)
@@ -170,6 +172,10 @@ class Picture:
                 moved = shifted(turned, (c + left - column) * cell_m, (r + top - row) * cell_m)
                 found.append(Peak(float(near[r, c]) * unit, moved, turn_deg))
         return sorted(found, key=lambda peak: -peak.worth)
+
+    def _fine_cell_m(self, matrix: FloatArray) -> float:
+        """Return the cells by which a place is weighed, metres: none is finer than those of the reduced frame."""
+        return max(_ROAD_M / 2.0, self.scene.field_scale * sampling(matrix, self.scene.size))
 
     def _around(self, matrix: FloatArray, cell_m: float, reach_m: float) -> Ground:
         """Draw the map's roads around a place."""
@@ -228,11 +234,6 @@ def _levels(scene: Scene, step: int, smaller: int) -> _Levels:
     on_road = np.log((1.0 - missing) * road + missing * other)
     elsewhere = np.log((1.0 - false) * other + false * road)
     return _Levels(np.where(seen, cells, np.uint8(neutral)), scene.field_scale * smaller, neutral, on_road, elsewhere)
-
-
-def fine_cell_m(gsd_m: float) -> float:
-    """Return the cells by which places are weighed, metres."""
-    return max(_ROAD_M / 2.0, 1.5 * gsd_m)
 
 
 def _length_px(cell_m: float, gsd_m: float) -> float:
