@@ -43,7 +43,7 @@ _ROAD_M = 8.0
 #: This length of the map's roads counts as one independent statement, metres, but never fewer than a fifth as many
 #: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
 #: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
-_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 280.0, 450.0, 0.2
+_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 320.0, 500.0, 0.2
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
 #: Pixel sizes, a factor apart, at which a drawn mask's roads are as wide as a road.
