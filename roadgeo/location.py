@@ -487,7 +487,16 @@ _ORDER = (
     *("options", "command", "crs", "size", "homography", "footprint", "footprint_lonlat", "center", "gsd_m"),
     *("rotation_deg", "tilt_deg", "tilt_source", "fitted", "lens_k1", "corner_sigma_m", "corner_covariance_m2"),
     *("center_error", "lonlat_sigma_m", "lonlat_accuracy_m", "camera", "mirrored", "query_to_pixel"),
-    *("part_read", "stated_offset_m", "rmse_m", "rmse_px", "n_intersections", "n_matched", "inlier_ratio", "log10_odds"),
+    *(
+        "part_read",
+        "stated_offset_m",
+        "rmse_m",
+        "rmse_px",
+        "n_intersections",
+        "n_matched",
+        "inlier_ratio",
+        "log10_odds",
+    ),
     *("error_rate", "runner_up", "alternatives", "seconds", "stats", "stopped"),
 )
 

@@ -334,8 +334,9 @@ def searched_within(options: LocateOptions) -> str:
     limits = []
     if options.near is not None:
         lon, lat, radius = options.near
-        reach = f"{radius:g} m" if radius < 1000 else f"{radius / 1000:g} km"
-        limits.append(f"within {reach} of {lon:.9g},{lat:.9g}")
+        rounded = float(f"{radius:.2g}")
+        reach = f"{rounded:g} m" if rounded < 1000 else f"{rounded / 1000:g} km"
+        limits.append(f"within {reach} of {round(lon, 5):.9g},{round(lat, 5):.9g}")
     if options.match.within is not None:
         limits.append("within longitudes {0:g} to {2:g} and latitudes {1:g} to {3:g}".format(*options.match.within))
     if camera.gsd_m != usual.gsd_m:

@@ -120,13 +120,18 @@ def _discount(location: Location, what: str, tried: int, options: LocateOptions)
         return location
     odds = location.log10_odds - off
     if odds < options.min_log10_odds:
-        few = f"seen in {tried} ways one place stands out, at {what}, but not clearly enough for so many tries"
+        few = f"one place stands out, at {what}, but not clearly enough; {_in_ways(tried)}"
         return _refused(location, few)
-    reason = f"{location.reason}; seen in another way ({what}) than at first"
+    reason = f"{location.reason}; {_in_ways(tried)}, here at {what}"
     center = None if location.center is None else replace(location.center, log10_odds=odds)
     others = tuple(_less_sure(place, off) for place in location.alternatives)
     runner_up = location.runner_up and _less_sure(location.runner_up, off)
     return replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others)
+
+
+def _in_ways(tried: int) -> str:
+    """Count the looks, as every reason does."""
+    return f"its roads were traced in {tried} ways"
 
 
 def _less_sure(place: Place, off: float) -> Place:
@@ -158,13 +163,13 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
     locations = [sighting.location for sighting in sightings]
     location = replace(best.location, seconds=total_seconds(*(sighting.location.seconds for sighting in sightings)))
     if len(sightings) > 1 and location.status == "not_located":
-        location = replace(location, reason=f"{location.reason} (seen in {len(sightings)} ways)")
+        location = replace(location, reason=f"{location.reason}; {_in_ways(len(sightings))}")
     rivals = [found for found in locations if found is not best.location and _elsewhere(found, location)]
     rival = max(rivals, key=lambda found: found.log10_odds or -math.inf, default=None)
     if location.located and rival is not None:
         lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
         if lead < options.min_margin:
-            reason = "seen in two ways it fits at two places, almost equally"
+            reason = f"two places fit almost equally; {_in_ways(len(sightings))}"
             others = (*rival.places[:1], *location.alternatives)
             location = replace(
                 location,

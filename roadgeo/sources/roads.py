@@ -268,7 +268,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
         "name": name,
         **source.meta,
         "lines": len(source.lines),
-        "kinds_known": source.highway is not None,
+        "kinds_known": source.highway is not None or which == "all",
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
         **({"astray": int(astray.sum())} if astray.any() else {}),

@@ -94,7 +94,7 @@ def test_several_thresholds_are_tried_before_a_refusal(porto: Path, capfd: pytes
     cv2.line(soft, (0, 200), (400, 200), 255, 9)
     cv2.imwrite("soft.png", cv2.GaussianBlur(soft, (0, 0), 6))
     assert locate("soft.png", porto) == 3
-    assert "(seen in " in capfd.readouterr().out
+    assert "; its roads were traced in " in capfd.readouterr().out
 
 
 def test_a_mirrored_mask_is_refused_with_the_reason(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

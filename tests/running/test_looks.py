@@ -53,7 +53,7 @@ def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
     assert location.status == "located"
     assert location.log10_odds == pytest.approx(9 - np.log10(3))
     assert location.center.log10_odds == location.log10_odds
-    assert "seen in another way" in location.reason
+    assert "its roads were traced in 3 ways, here at look 2" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
 
 

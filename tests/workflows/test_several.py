@@ -193,7 +193,7 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
     [
         (None, {}, "; more roads in view or another map may help"),
         (NEAR, {}, "; searched within 500 m of -71.06,42.36: more roads in view or a wider search may help"),
-        ((8.123456, -1.0, 1234567.0), {}, "; searched within 1234.57 km of 8.123456,-1: "),
+        ((8.123456, -1.0, 1234567.0), {}, "; searched within 1200 km of 8.12346,-1: "),
         (None, {"gsd_m": (0.5, 1.0)}, "; searched at 0.5 to 1 m per pixel: "),
         (None, {"max_tilt_deg": 20.0}, "; searched tilted by up to 20 degrees: "),
         (None, {"focal_px": 1280.0}, "; searched with a focal length of 1280 pixels: "),
