@@ -145,10 +145,8 @@ class Camera:
         """Plain values."""
         sigma = np.sqrt(np.diag(self.covariance)).tolist()
         names = ("x_m", "y_m", "height_m", "heading_deg", "pitch_deg", "roll_deg")
-        known = {name: getattr(self, name) for name in ("x", "y", "lon", "lat", *names[2:])}
-        plain = ("ground_m", "ground_spread_m", "altitude_m", "focal_px", "source")
+        plain = ("x", "y", "lon", "lat", *names[2:], "ground_m", "ground_spread_m", "altitude_m", "focal_px", "source")
         return {
-            **known,
             **{name: getattr(self, name) for name in plain},
             "sigma": {**dict(zip(names, sigma, strict=True)), "focal_px": self.focal_sigma_px},
             "covariance": self.covariance.tolist(),
@@ -261,8 +259,8 @@ class Location:
         The best other places on any of the references, best first, in the CRS of the best one. Where nothing is
         located, the best place that there was comes first.
     stopped : str
-        Why the search ended: "accepted", an answer that stands out; "exhausted", nothing was left to try; "work" or
-        "time", a limit. Only with "time" may the answer depend on the machine and its load. "" where none was needed.
+        Why the search ended: "accepted", "exhausted" (nothing was left to try), or at a limit, "work" or "time". Only
+        with "time" may the answer depend on the machine and its load. "" where no search was needed.
     options : dict or None
         Options that differ from the defaults, in plain values; None: not recorded.
     query_to_pixel : (3, 3) float64 or None
@@ -355,9 +353,8 @@ class Location:
     @property
     def error_rate(self) -> ErrorRate | None:
         """How often places of such scores were wrong; None where none is reported, or with a lower score than usual."""
-        if not self.located or self.log10_odds is None:
-            return None
-        return next((rate for rate in reversed(ERROR_RATES) if self.log10_odds >= rate.score), None)
+        score = self.log10_odds if self.located else None
+        return None if score is None else next((rate for rate in reversed(ERROR_RATES) if score >= rate.score), None)
 
     def pixel_to_map(self, pixels: FloatArray) -> FloatArray:
         """Take (..., 2) pixel positions (column, row; the top-left corner is 0, 0) to the location's CRS.
@@ -487,17 +484,8 @@ _ORDER = (
     *("options", "command", "crs", "size", "homography", "footprint", "footprint_lonlat", "center", "gsd_m"),
     *("rotation_deg", "tilt_deg", "tilt_source", "fitted", "lens_k1", "corner_sigma_m", "corner_covariance_m2"),
     *("center_error", "lonlat_sigma_m", "lonlat_accuracy_m", "camera", "mirrored", "query_to_pixel"),
-    *(
-        "part_read",
-        "stated_offset_m",
-        "rmse_m",
-        "rmse_px",
-        "n_intersections",
-        "n_matched",
-        "inlier_ratio",
-        "log10_odds",
-    ),
-    *("error_rate", "runner_up", "alternatives", "seconds", "stats", "stopped"),
+    *("part_read", "stated_offset_m", "rmse_m", "rmse_px", "n_intersections", "n_matched", "inlier_ratio"),
+    *("log10_odds", "error_rate", "runner_up", "alternatives", "seconds", "stats", "stopped"),
 )
 
 
