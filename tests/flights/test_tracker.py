@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shapely
+from worlds.lattices import lattice
 
 from examples.simulated_flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
@@ -14,10 +14,7 @@ from roadgeo.flights.pose import start
 from roadgeo.flights.rows import make_rows
 from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, track
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.geometry.projection import LocalPlane
-from roadgeo.matching.index import build_index
 from roadgeo.reference.reference import Reference
-from roadgeo.roads.network import build_network
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 
@@ -104,24 +101,16 @@ def test_without_motion_a_flight_is_lost(flight):
 
 
 @pytest.fixture(scope="module")
-def lattice():
+def blocks():
     """Equal blocks of 110 x 90 m, of which some are not parted by a street."""
-    rng = np.random.default_rng(5)
-    lines = [
-        shapely.LineString([a, b])
-        for x in range(0, 3300, 110)
-        for y in range(0, 3150, 90)
-        for a, b in (((x, y), (x + 110, y)), ((x, y), (x, y + 90)))
-        if rng.random() < 0.9
-    ]
-    network = build_network(lines, LocalPlane("EPSG:32619", (330000.0, 4690000.0)), {"name": "lattice"})
+    network, index = lattice(0.9)
     flown = simulate_flight(Landscape.from_network(network), replace(OPTIONS, n_frames=(12, 12)), 3)
-    return flown, Reference(build_index(network), network)
+    return flown, Reference(index, network)
 
 
-def test_frames_are_followed_where_a_block_beside_would_do_as_well(lattice):
+def test_frames_are_followed_where_a_block_beside_would_do_as_well(blocks):
     """What is known is not a block off: that streets are alike tells nothing against a frame that was followed."""
-    flown, reference = lattice
+    flown, reference = blocks
     tracker = Tracker([reference])
     statuses = []
     for k, mask in enumerate(flown.masks()):

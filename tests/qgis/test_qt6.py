@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -75,24 +74,3 @@ def test_a_new_row_of_the_table_is_an_option_everywhere(python: str, tmp_path: P
     for name in ("locatemask", "locatemasks", "georeferenceimage"):
         assert algorithms[name]["CLOUD"] == "QgsProcessingParameterNumber"
         assert algorithms[name]["EFFORT"] == "QgsProcessingParameterEnum"
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new"),
-    [
-        ("session.py", "from qgis.PyQt import sip", "import sip"),
-        ("dock.py", "QDockWidget,", "QDockWidget, QDesktopWidget,"),
-        ("places.py", "QHeaderView.ResizeMode.Stretch", "QHeaderView.Stretch"),
-    ],
-)
-def test_what_only_pyqt5_knows_is_found(
-    python: str, plugin: Path, tmp_path: Path, file: str, old: str, new: str
-) -> None:
-    other = tmp_path / "other_plugin"
-    shutil.copytree(plugin, other, ignore=shutil.ignore_patterns("__pycache__"))
-    text = (other / file).read_text("utf-8")
-    assert old in text
-    (other / file).write_text(text.replace(old, new), "utf-8")
-    done = run(python, other)
-    assert done.returncode == 1
-    assert "Error" in done.stderr

@@ -4,9 +4,9 @@ import contextlib
 import functools
 import http.server
 import shutil
-import threading
 
 import pytest
+from support.loopback import serving
 from worlds.scenes import random_network
 
 from roadgeo.errors import IndexFormatError
@@ -200,14 +200,8 @@ def test_a_redirect_within_a_server_is_followed_and_none_to_another(built, tmp_p
 def _serving(handler):
     """Serve on this machine; yield the port."""
     pytest.importorskip("aiohttp")
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
-        thread.start()
-        try:
-            yield server.server_port
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(handler) as server:
+        yield server.server_port
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):

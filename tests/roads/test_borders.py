@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from worlds.bent import street_grid
 
 from roadgeo.roads.borders import find_border
 
@@ -10,16 +11,7 @@ MAP, WIDTH = 600, 7
 
 
 def city(seed: int = 0, straight: bool = False) -> np.ndarray:
-    """A mask of a street grid, bent or of straight streets as a lattice has them."""
-    rng = np.random.default_rng(seed)
-    image = np.zeros((MAP, MAP), np.uint8)
-    for offset in range(40, MAP, 70):
-        for turn in (False, True):
-            across = np.linspace(-50, MAP + 50, 8)
-            along = offset + (0.0 if straight else 1.0) * rng.uniform(-15, 15, 8)
-            line = np.stack((along, across) if turn else (across, along), axis=1)
-            cv2.polylines(image, [np.rint(line).astype(np.int32)], False, 255, WIDTH - 2)
-    return image
+    return street_grid(MAP, 40, 70, WIDTH - 2, seed, straight)
 
 
 def sheet(

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from worlds.bent import street_grid
 
 from roadgeo.roads.observed import find_voids
 
@@ -10,16 +11,7 @@ SIZE, WIDTH = 600, 7
 
 
 def city(spacing: int = 70, seed: int = 0) -> np.ndarray:
-    """A mask of a bent street grid, so that no two streets end alike."""
-    rng = np.random.default_rng(seed)
-    image = np.zeros((SIZE, SIZE), np.uint8)
-    for offset in range(20, SIZE, spacing):
-        for turn in (False, True):
-            across = np.linspace(-50, SIZE + 50, 8)
-            along = offset + rng.uniform(-15, 15, 8)
-            line = np.stack((along, across) if turn else (across, along), axis=1)
-            cv2.polylines(image, [np.rint(line).astype(np.int32)], False, 255, WIDTH - 2)
-    return image
+    return street_grid(SIZE, 20, spacing, WIDTH - 2, seed)
 
 
 def warped(image: np.ndarray, corners: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -272,11 +272,3 @@ def missing_files(text, folder):
         for name in named
         if not (ROOT / name).exists() and not any(f"/{item}".endswith(f"/{name}") for item in there)
     )
-
-
-# What the blocks of a page print: PYTHONPATH=tests python tests/support/documents.py PAGE, in a scratch folder.
-if __name__ == "__main__":
-    for part in blocks(Path(sys.argv[1]).read_text(encoding="utf-8")):
-        if part.language == "bash":
-            for line, wanted in part.commands():
-                print(f"$ {line}\n{run_command(line, wanted, line=part.line)}")

@@ -1,9 +1,23 @@
-"""A server on this machine that counts what is asked of it: what reads a file of strangers must ask nothing."""
+"""Servers on this machine; one of them counts what is asked: what reads a file of strangers must ask nothing."""
 
 import http.server
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
+
+
+@contextmanager
+def serving(handler: Any) -> Iterator[http.server.ThreadingHTTPServer]:
+    """Serve on a port that nobody uses."""
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 class Counting(http.server.BaseHTTPRequestHandler):
@@ -24,13 +38,6 @@ class Counting(http.server.BaseHTTPRequestHandler):
 @contextmanager
 def counting_server() -> Iterator[tuple[str, list[str]]]:
     """Yield the server's address and the list of paths asked for so far."""
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Counting)
-    server.asked = []  # type: ignore[attr-defined]
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
-    thread.start()
-    try:
+    with serving(Counting) as server:
+        server.asked = []  # type: ignore[attr-defined]
         yield f"http://127.0.0.1:{server.server_port}", server.asked  # type: ignore[attr-defined]
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()

@@ -1,14 +1,14 @@
 """A Nominatim and an Overpass on loopback, that give real answers and misbehave on request."""
 
 import json
-import threading
 from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from urllib.parse import parse_qs, urlsplit
 
 import shapely
+from support.loopback import serving
 
 from worlds.fenway import ANSWER
 
@@ -101,13 +101,6 @@ def fake_osm():
             state.queries.append(parse_qs(body)["data"][0])
             self.give(state.overpass, state.roads)
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    state.url = f"http://127.0.0.1:{server.server_address[1]}"
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    try:
+    with serving(Handler) as server:
+        state.url = f"http://127.0.0.1:{server.server_port}"
         yield state
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()

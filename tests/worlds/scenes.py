@@ -11,6 +11,7 @@ from roadgeo.matching.scene import Scene, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
+from worlds.drawn import mapped
 
 __all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
 
@@ -81,12 +82,6 @@ def camera(
     matrix = np.array([-eye[2] * rays[0] + eye[0] * rays[2], -eye[2] * rays[1] + eye[1] * rays[2], rays[2]])
     matrix = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]]) @ matrix
     return matrix / (matrix[2] @ (size[0] / 2, -size[1] / 2, 1))
-
-
-def mapped(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Points (N, 2) under a homography."""
-    homogeneous = np.c_[xy, np.ones(len(xy))] @ matrix.T
-    return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
-from roadgeo.sources.segmentation.tiling import _look, _starts, segment
+from roadgeo.sources.segmentation.tiling import _look, segment
 
 MODELS = Path(__file__).parents[2] / "data" / "models"
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -84,18 +84,6 @@ def test_bands_are_taken_in_the_order_asked_for(tmp_path: Path) -> None:
     assert rgb[0, 0].tolist() == [110, 60, 10]
     with pytest.raises(MaskError, match="has no band 5; expected 1 to 4"), open_photograph(path, (5, 2, 1)):
         pass
-
-
-@pytest.mark.parametrize("side", [64, 65, 100, 127, 400])
-@pytest.mark.parametrize("overlap", [0.05, 0.25, 0.5])
-def test_tiles_cover_a_side(side: int, overlap: float) -> None:
-    starts = _starts(side, 64, overlap)
-    covered = np.zeros(side, int)
-    for start in starts:
-        assert start >= 0
-        assert start + 64 <= side
-        covered[start : start + 64] += 1
-    assert covered.min() > 0
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (70, 300), (90, 66)])
