@@ -214,7 +214,8 @@ def locate(
     """
     from roadgeo.running.choosing import choose_place
     from roadgeo.running.looks import Sighting
-    from roadgeo.running.pictures import read_picture
+    from roadgeo.running.options import ReadOptions
+    from roadgeo.running.pictures import pixels_of, read_picture
     from roadgeo.running.queries import locate_query
     from roadgeo.workflows import locate as locate_mask
 
@@ -242,7 +243,7 @@ def locate(
     if picture is None:
         sighting = Sighting(choose_place(locate_mask(mask, references, options), options), mask)
     else:
-        sighting = locate_query(picture, references, options)
+        sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
     origin = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
     found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
     indexes = tuple(item.index_of(sighting.location) for item in references)

@@ -52,6 +52,7 @@ from roadgeo.running.batch import Outcome, locate_masks, open_references, write_
 from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import SUFFIXES, find_masks, name_tasks
 from roadgeo.storage.files import make_folder
+from roadgeo.storage.rasters import name_page
 
 if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions
@@ -62,8 +63,8 @@ _LOG = logging.getLogger(__name__)
 
 #: Options without an effect on a result, or with a value for each mask.
 _OF_NO_ACCOUNT = {
-    *("as_json", "divide_map", "engine", "images", "jobs", "quiet", "recursive", "scheduler", "skip_existing"),
-    "verbose",
+    *("as_json", "divide_map", "engine", "images", "jobs", "page", "quiet", "recursive", "scheduler"),
+    *("skip_existing", "verbose"),
 }
 
 _HELP = """Find where aerial images lie on a map, and draw them there.
@@ -153,6 +154,8 @@ _OPTIONS = (
         "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
         default="auto", show_default=True, rare=True),
     row("--layer", "NAME", IMAGE, "Layer of roads that come as lines.", rare=True),
+    row("--page", "N", IMAGE,
+        "Page of a TIFF that holds several. Default: the first.", type=click.IntRange(1), rare=True),
     take("jobs"),
     row("--method", ("auto", "pair"), SEARCH,
         "auto: the best there is, the default. pair: exactly the paper's matcher.", default="auto", rare=True),
@@ -195,8 +198,9 @@ def locate_command(
     found = find_masks(masks, given["recursive"])
     if not found:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
+    found = [name_page(name, given["page"]) for name in found]
     others = found[1:] if given["fuse"] else []
-    tasks = name_tasks(found[:1] if given["fuse"] else found)
+    tasks = name_tasks(found[:1] if given["fuse"] else found, out_dir)
     cluster = make_cluster(given, jobs)
     if given["divide_map"] and (cluster is None or given["method"] == "pair" or given["explain"]):
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import pyproj
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
@@ -14,10 +15,12 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, to_lonlat, to_plane, transform
 from roadgeo.storage.orientation import stored_from_upright
 
-__all__ = ["Georeference", "fit_place"]
+__all__ = ["Georeference", "fit_place", "stretch_of"]
 
 #: Side of the grid of points that a georeference is taken to another CRS by.
 _GRID = 5
+#: Logarithm of the shape of pixels that count as square, and the greatest that is believed.
+_SQUARE, _MOST_STRETCH = 0.02, 8.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,19 @@ class Georeference:
         lon, lat = to_lonlat(self.crs, self._there(np.array([Frame(*self.size).center])))[0].tolist()
         return lon, lat
 
+    def pixel_shape(self) -> tuple[float | None, bool]:
+        """Return how many times a pixel in the middle is as wide as high, and whether rows run northwards.
+
+        None for square ones.
+        """
+        spots = np.array([[0.25, 0.5], [0.75, 0.5], [0.5, 0.25], [0.5, 0.75]]) * self.size
+        lon, lat = to_lonlat(self.crs, self._there(spots)).T
+        if not np.isfinite([lon, lat]).all():
+            return None, False
+        azimuths, _, lengths = pyproj.Geod(ellps="WGS84").inv(lon[::2], lat[::2], lon[1::2], lat[1::2])
+        (wide, high), (across, down) = lengths / np.array(self.size), np.radians(azimuths)
+        return stretch_of(wide, high), bool(np.sin(down - across) < 0.0)
+
     def moved(self, on_plane: FloatArray, plane: LocalPlane) -> Georeference:
         """Return the georeference that puts the raster where `on_plane` (3, 3), pixels to a plane, does.
 
@@ -89,6 +105,13 @@ class Georeference:
     def _there(self, pixels: FloatArray) -> FloatArray:
         """Take pixel positions (N, 2) to the CRS."""
         return Homography(self.matrix).facing(Frame(*self.size).center)(pixels)
+
+
+def stretch_of(wide: float, high: float) -> float | None:
+    """Return the width of a pixel in heights; None where it is almost square, or of no sensible shape."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stretch = float(np.abs(np.divide(wide, high)))
+    return stretch if 1.0 / _MOST_STRETCH < stretch < _MOST_STRETCH and abs(np.log(stretch)) > _SQUARE else None
 
 
 def fit_place(pixels: FloatArray, xy: FloatArray, projective: bool) -> FloatArray:

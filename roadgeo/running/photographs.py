@@ -273,7 +273,7 @@ def locate_photograph(
             return _see_hardly_a_road(frame, error, references)
     sighting = _in_own_pixels(found, frame.own)
     reason = sighting.location.reason.replace(searched_within(on_grid), searched_within(options))
-    return replace(sighting, location=replace(sighting.location, reason=reason))
+    return replace(sighting, location=replace(sighting.location, reason=reason, part_read=frame.first.page))
 
 
 def _see_hardly_a_road(frame: Frame, error: MaskError, references: Sequence[AnyReference]) -> Sighting:

@@ -14,10 +14,16 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
+from roadgeo.geometry.georeference import Georeference, stretch_of
 from roadgeo.roads.thresholds import are_labels
+from roadgeo.storage.crs import crs_name
 from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
-__all__ = ["as_file", "read_picture"]
+__all__ = ["as_file", "pixels_of", "read_picture"]
+
+#: Names of the axes of a picture, and of the columns where they are degrees.
+_ROWS, _DEGREES = {"y", "row", "rows", "lat", "latitude"}, {"lon", "longitude"}
+_COLUMNS = {"x", "column", "col"} | _DEGREES
 
 #: An axis no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
@@ -50,6 +56,38 @@ def read_picture(picture: Any) -> str | AnyArray:
     if array.ndim not in (2, 3):
         raise MaskError(f"an array of shape {array.shape}; expected (rows, columns), with bands first or last")
     return _bands_last(array)
+
+
+def pixels_of(picture: Any) -> dict[str, Any]:
+    """Return what xarray says of a picture, as fields of `ReadOptions`: names of bands, shape of pixels, order of rows.
+
+    Its `attrs["long_name"]` or the coordinates of its third axis are names. Axes called lat and lon, or a geographic
+    CRS as rioxarray writes it, are in degrees.
+    """
+    if not (hasattr(picture, "dims") and hasattr(picture, "coords")):
+        return {}
+    rows, columns = (_axis(picture, names) for names in (_ROWS, _COLUMNS))
+    rest = [name for name in picture.dims if name not in (rows, columns)]
+    labels = picture.coords[rest[0]].values if len(rest) == 1 and rest[0] in picture.coords else ()
+    labels = named if isinstance(named := picture.attrs.get("long_name"), tuple | list) else labels
+    known: dict[str, Any] = {"names": tuple(label for label in labels if isinstance(label, str))}
+    if rows is None or columns is None or not {rows, columns} <= set(picture.coords):
+        return known
+    x, y = (np.asarray(picture.coords[name].values, float) for name in (columns, rows))
+    if min(len(x), len(y)) < 2 or not np.isfinite([*x[[0, -1]], *y[[0, -1]]]).all() or x[0] == x[-1] or y[0] == y[-1]:
+        return known
+    wide, high = (x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)
+    place = np.array([[wide, 0.0, x[0] - wide / 2], [0.0, high, y[0] - high / 2], [0.0, 0.0, 1.0]])
+    crs = str(getattr(picture.coords.get("spatial_ref"), "attrs", {}).get("crs_wkt") or "")
+    named_crs = crs_name(crs) if crs else "EPSG:4326" if str(columns).lower() in _DEGREES else None
+    aspect, is_mirrored = stretch_of(wide, high), wide * high > 0.0 and (y[0], high) not in ((0.0, 1.0), (0.5, 1.0))
+    if named_crs is not None:
+        aspect, is_mirrored = Georeference(place, named_crs, (len(x), len(y)), "geotransform").pixel_shape()
+    return {**known, "aspect": aspect, "mirror": "allow" if is_mirrored else "tell"}
+
+
+def _axis(data: Any, names: set[str]) -> Any:
+    return next((name for name in data.dims if str(name).lower() in names), None)
 
 
 @contextmanager
@@ -116,12 +154,11 @@ def _read_dataset(dataset: Any) -> str | AnyArray:
 
 def _read_xarray(data: Any) -> AnyArray:
     """Take the last two axes, or those called y and x (row and column, latitude and longitude), for the picture's."""
-    names = [str(name).lower() for name in data.dims]
-    rows = next((i for i, name in enumerate(names) if name in {"y", "row", "rows", "lat", "latitude"}), None)
-    columns = next((i for i, name in enumerate(names) if name in {"x", "column", "col", "lon", "longitude"}), None)
+    names = [str(name) for name in data.dims]
     values = np.asarray(data.values)
-    if rows is None or columns is None:
+    if (row_axis := _axis(data, _ROWS)) is None or (column_axis := _axis(data, _COLUMNS)) is None:
         return _bands_last(values)
+    rows, columns = data.dims.index(row_axis), data.dims.index(column_axis)
     rest = [i for i in range(values.ndim) if i not in (rows, columns)]
     if len(rest) > 1:
         raise MaskError(f"an array of the dimensions {', '.join(names)}; choose a time or level first")

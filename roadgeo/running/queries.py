@@ -22,6 +22,7 @@ from roadgeo.running.photographs import Look, call_segmenter, locate_photograph,
 from roadgeo.running.pictures import as_file
 from roadgeo.running.variants import try_variants
 from roadgeo.sources.drawn_roads import draw_roads
+from roadgeo.sources.georeference import read_pixel_shape
 from roadgeo.sources.masks import MaskSource, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.streams import QUERY_ENDINGS
@@ -74,14 +75,25 @@ def _look_for(
         with _open_as_mask(path, reading) as mask:
             if mask is not None:
                 sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
-                sighting = try_variants(sighting, references, options, reading, how)
+                sighting = try_variants(sighting, references, options, _as_stated(path, reading, sighting), how)
                 return replace(sighting, location=replace(sighting.location, part_read=mask.part))
     with as_file(path) as file:
         sighting = locate_photograph((file, *reading.fused_with), references, options, reading, how, say)
         if not isinstance(path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
             sighting = replace(sighting, location=replace(sighting.location, query=_ARRAY, reason=reason))
+    if (stated := _as_stated(path, reading, sighting)) != reading:
+        sighting = try_variants(sighting, references, options, stated, how)
     return replace(sighting, of_photograph=True)
+
+
+def _as_stated(path: str | AnyArray, reading: ReadOptions, sighting: Sighting) -> ReadOptions:
+    """Return how an image that is not located is read, with the shape of its pixels that its file states by default."""
+    if not isinstance(path, str) or sighting.location.located or reading.mirror == "never":
+        return reading
+    aspect, is_mirrored = read_pixel_shape(path)
+    reading = replace(reading, aspect=aspect) if reading.aspect is None else reading
+    return replace(reading, mirror="allow") if is_mirrored else reading
 
 
 @dataclass(frozen=True)

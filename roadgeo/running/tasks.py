@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import json
 import logging
 import os
 import re
@@ -13,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadgeo._text import visible
-from roadgeo.outputs.registry import is_result, result_endings
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.registry import JSON, is_result, result_endings
 from roadgeo.running.probability_files import ENDING, is_ours
+from roadgeo.storage.rasters import RAW
 
 __all__ = ["SUFFIXES", "Task", "find_masks", "in_natural_order", "name_tasks"]
 
@@ -28,7 +31,7 @@ SUFFIXES = (
 #: Suffixes of pictures that are not read.
 _NOT_READ = (
     *(".heic", ".heif", ".avif", ".jxl", ".svg", ".psd", ".exr", ".tga", ".ecw", ".sid"),
-    *(".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw"),
+    *RAW,
 )
 
 #: File systems take names of 255 bytes; outputs, and their temporary names, need the rest.
@@ -104,8 +107,10 @@ def _is_mask(path: Path, endings: tuple[str, ...], suffixes: tuple[str, ...]) ->
     return not (path.name.endswith(ENDING) and is_ours(path))
 
 
-def name_tasks(masks: Sequence[str]) -> list[Task]:
+def name_tasks(masks: Sequence[str], out_dir: str | os.PathLike[str] | None = None) -> list[Task]:
     """Give each mask the stem of its own name; those that would share one get more of their path, until none does.
+
+    So do masks whose results would replace those of another picture in a folder.
 
     So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
     """
@@ -114,16 +119,36 @@ def name_tasks(masks: Sequence[str]) -> list[Task]:
     while True:
         stems = [stems[level] for stems, level in zip(known, used, strict=True)]
         taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that ignore case
-        shared = [n for n, stem in enumerate(stems) if taken[stem.casefold()] > 1 and used[n] < len(known[n]) - 1]
+        shared = [
+            n
+            for n, stem in enumerate(stems)
+            if used[n] < len(known[n]) - 1 and (taken[stem.casefold()] > 1 or _is_anothers(out_dir, stem, masks[n]))
+        ]
         if not shared:
             return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]
         for n in shared:
             used[n] += 1
 
 
+def _is_anothers(out_dir: str | os.PathLike[str] | None, stem: str, mask: str) -> bool:
+    """Whether a folder holds a result of that stem of a picture that is not this one by its path, as far as known."""
+    if out_dir is None:
+        return False
+    try:
+        document = json.loads(output_paths(out_dir, stem).of(JSON).read_text(encoding="utf-8"))
+        query = str(document["query"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return False
+    theirs, ours = ([part for part in Path(name).parts if part != ".."] for name in (query, Task(mask, stem).query))
+    n = min(len(theirs), len(ours))  # paths may be relative to different folders
+    return theirs[-n:] != ours[-n:]
+
+
 def _stems(mask: str, n: int) -> list[str]:
     """Return longer and longer stems for the n-th mask: its name, its folder, its format, its path, its number."""
-    path = Path(mask).absolute()
+    page = re.match(r"GTIFF_DIR:(\d+):", mask)
+    path = Path(mask[page.end() :] if page else mask).absolute()
+    path = path.with_stem(f"{path.stem}_page{page[1]}") if page else path
     folder = f"{path.parent.name}_{path.stem}"
     format_ = f"{folder}_{path.suffix.lower().removeprefix('.')}"
     whole = f"{format_}_{_digest(os.fspath(path))}"

@@ -8,7 +8,7 @@ located is given in pixels of the mask.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,7 +53,12 @@ class Variant:
 
 def mirrored(mask: RoadMask) -> Variant:
     """Return a mask turned over, left to right."""
-    return Variant(mask.mirrored(), np.array([[-1.0, 0.0, mask.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    return _turned_over(Variant(mask, np.eye(3)))
+
+
+def _turned_over(variant: Variant) -> Variant:
+    over = np.array([[-1.0, 0.0, variant.mask.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return Variant(variant.mask.mirrored(), over @ variant.matrix)
 
 
 def stretched(mask: RoadMask, stretch: float) -> Variant:
@@ -140,15 +145,18 @@ def try_variants(
 ) -> Sighting:
     """Try the variants of a refused mask; the first that is located is the answer, where the user allows for it.
 
-    Stretched masks are tried where `reading.aspect` is given. Else the mask is turned over, and a refusal mentions
+    Stretched masks are tried where `reading.aspect` is given, and turned over where that is allowed. Else the mask is
+    turned over, and a refusal mentions
     where it lies then: a mirrored image has no place, and only its owner knows how it came about. Where mirrored masks
     are allowed the search is as thorough as any. Each try could agree by chance: together they pay for all of them.
     """
-    refused, allowed = sighting.location, reading.aspect is not None or reading.mirror == "allow"
+    refused, may_mirror = sighting.location, reading.mirror == "allow"
+    allowed = reading.aspect is not None or may_mirror
     if reading.aspect is not None:
         stretches = STRETCHES if reading.aspect == "unknown" else (reading.aspect,)
-        asked, n_variants = not refused.located, len(stretches)
-        variants: Iterator[Variant] = (stretched(sighting.mask, stretch) for stretch in stretches)
+        asked, n_variants = not refused.located, len(stretches) * (1 + may_mirror)
+        upright = (stretched(sighting.mask, stretch) for stretch in stretches)
+        variants = (v for variant in upright for v in (variant, _turned_over(variant))[: 1 + may_mirror])
     else:
         asked = reading.mirror != "never" and refused.status == "not_located" and options.method != "pair"
         asked, n_variants = asked and refused.reason_code in _WORTH_A_TRY, 1
@@ -180,7 +188,7 @@ def _as_answer(found: Location, variant: Variant, mask: RoadMask) -> Location:
     """Return the place of a variant as it is of the mask; no camera saw the ground so."""
     location = replace(in_pixels_of(found, mask.shape[::-1], variant.matrix), camera=None)
     if np.linalg.det(variant.matrix) < 0.0:
-        reason = f"{found.reason}; the mask is mirrored: it was turned over, left to right"
+        reason = f"{found.reason}; the mask is mirrored, or the map is: it was turned over, left to right"
         return replace(location, reason=reason, mirrored=True)
     if location.homography is None:
         return location
@@ -196,6 +204,6 @@ def _mentioned(refused: Location, found: Location) -> Location:
     where = format_lonlat(found.center.lon, found.center.lat)
     reason = (
         f"the mask is mirrored: turned over, left to right, it lies at {where} on {found.reference}; "
-        "flip the image and locate it again"
+        "flip the image and locate it again. Or the map is mirrored, its x and y exchanged"
     )
     return replace(refused, reason=reason, reason_code=Reason.MIRRORED)

@@ -15,7 +15,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import are_labels
-from roadgeo.storage.rasters import open_raster, sidecar_nodata
+from roadgeo.storage.rasters import open_raster, page_of, sidecar_nodata
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -66,6 +66,8 @@ class Raster:
         Number and name of each band that is read, for people: "2 (road)".
     all_bands : tuple of str
         The same of all bands.
+    page : str
+        Of a file with several, for people.
     has_alpha : bool
         Values are valid where they are not transparent.
     model_threshold : float or None
@@ -80,6 +82,7 @@ class Raster:
     all_bands: tuple[str, ...] = ()
     has_alpha: bool = False
     is_chosen: bool = False
+    page: str = ""
     model_threshold: float | None = None
 
     @property
@@ -173,7 +176,7 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
     size, own = (dataset.height, dataset.width), _model_threshold(dataset)
-    return Raster(name, size, len(bands), read, bands, labels, has_alpha, is_chosen, own)
+    return Raster(name, size, len(bands), read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
 
 
 def _model_threshold(dataset: DatasetReader) -> float | None:

@@ -18,7 +18,7 @@ from roadgeo.storage.rasters import open_raster
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["read_georeference", "read_stated_middle"]
+__all__ = ["read_georeference", "read_pixel_shape", "read_stated_middle"]
 
 _WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
@@ -61,15 +61,24 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
 
 def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | None:
     """Return longitude and latitude of the middle of a raster by its own georeference; None where it has none."""
-    try:
-        with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-            if not file.read(8).startswith(_HOLD_A_PLACE):
-                return None
-        found = read_georeference(path)
-    except (MaskError, CrsError, OSError, ValueError):
-        return None
+    found = _stated(path)
     middle = found.middle() if found is not None else (np.nan, np.nan)
     return middle if np.isfinite(middle).all() else None
+
+
+def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:
+    """Return the shape of a raster's pixels as `Georeference.pixel_shape`; (None, False) where it states none."""
+    found = _stated(path)
+    return (None, False) if found is None or found.source == "control points" else found.pixel_shape()
+
+
+def _stated(path: str | os.PathLike[str]) -> Georeference | None:
+    """Return a raster's own georeference, where it has one."""
+    try:
+        with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+            return read_georeference(path) if file.read(8).startswith(_HOLD_A_PLACE) else None
+    except (MaskError, CrsError, OSError, ValueError):
+        return None
 
 
 def _crs_of(raster: DatasetReader) -> str | None:

@@ -171,7 +171,9 @@ def _part_of(raster: Raster, seen: AnyArray, channel: int, choice: Choice) -> st
     """Return which band of (n, B) values is read, and which class, where there are others."""
     total, are_alike = len(raster.all_bands), not raster.is_chosen and (seen == seen[:, :1]).all()
     band = "" if total < 2 or are_alike else f"band {raster.bands[channel]} of {total}"
-    return ", ".join(filter(None, [band, "" if choice.road_class is None else f"class {choice.road_class}"]))
+    return ", ".join(
+        filter(None, [raster.page, band, "" if choice.road_class is None else f"class {choice.road_class}"])
+    )
 
 
 def _drawn(raster: Raster) -> Raster:

@@ -25,7 +25,7 @@ from roadgeo.sources.containers import held_table
 from roadgeo.sources.lines import RoadLines, cut_lines
 from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
 from roadgeo.sources.schemas import recognise
-from roadgeo.sources.streams import list_sources, read_lines, tell_source
+from roadgeo.sources.streams import EXCHANGED, list_sources, read_lines, tell_source
 from roadgeo.storage.crs import known_crs, name_crs
 
 __all__ = [
@@ -271,6 +271,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
         "kinds_known": source.highway is not None or which == "all",
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
+        **({"exchanged": True} if _are_exchanged(chosen) else {}),
         **({"astray": int(astray.sum())} if astray.any() else {}),
         **({"without_kind": kindless} if kindless else {}),
         "kept": len(chosen.lines),
@@ -339,10 +340,8 @@ def _astray(source: RoadLines, name: str) -> BoolArray:
     sound = np.asarray((np.isfinite(lonlat) & (np.abs(lonlat) <= (360.0, 90.0) * 2)).all(axis=1))
     if np.count_nonzero(~sound) > _MOST_ASTRAY * len(sound):
         reach = np.abs(shapely.total_bounds(source.lines)).max()
-        raise CrsError(
-            f"{name}: coordinates reach {reach:.6g} and do not fit its CRS, {str(source.crs)[:40]}; "
-            "give the right one with --crs"
-        )
+        hint = EXCHANGED if _are_exchanged(source) else "give the right one with --crs"
+        raise CrsError(f"{name}: coordinates reach {reach:.6g} and do not fit its CRS, {str(source.crs)[:40]}; {hint}")
     coords, line = shapely.get_coordinates(source.lines, return_index=True)
     suspected = np.isin(np.arange(len(sound)), line[(coords == 0.0).all(axis=1)])
     others = lonlat[sound & ~suspected].reshape(-1, 2)
@@ -350,6 +349,21 @@ def _astray(source: RoadLines, name: str) -> BoolArray:
         apart = np.abs(others - to_lonlat(str(source.crs), np.zeros((1, 2)))).max(axis=1)
         sound &= ~suspected | bool((apart < _FAR_DEG).any())
     return ~sound
+
+
+def _are_exchanged(source: RoadLines) -> bool:
+    """Whether lines lie outside the area that their CRS is made for, and within it with coordinates exchanged."""
+    import shapely
+
+    area = known_crs(str(source.crs)).area_of_use
+    if area is None or not len(source.lines) or area.west > area.east:
+        return False
+    bounds = shapely.bounds(source.lines)
+    middles = (bounds[:, :2] + bounds[:, 2:]) / 2.0
+    there = [to_lonlat(str(source.crs), xy) for xy in (middles, middles[:, ::-1])]
+    low, high = (area.west, area.south), (area.east, area.north)
+    given, exchanged = (float(((xy >= low) & (xy <= high)).all(axis=1).mean()) for xy in there)
+    return given < _MOST_ASTRAY and exchanged > 1.0 - _MOST_ASTRAY
 
 
 def _ask_exchanged(bbox: Box | None, corners: Sequence[FloatArray] | None = None) -> str:

@@ -19,7 +19,7 @@ from roadgeo.storage.geopackage import layer_names
 from roadgeo.storage.unpacking import PACKED, unpack
 from roadgeo.storage.vectors import first_line, require_file
 
-__all__ = ["QUERY_ENDINGS", "list_sources", "read_lines", "reading", "stream_lines", "tell_source"]
+__all__ = ["EXCHANGED", "QUERY_ENDINGS", "list_sources", "read_lines", "reading", "stream_lines", "tell_source"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -29,6 +29,7 @@ QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for 
 #: Number of features by which a file of a folder is recognised as roads.
 _LOOK = 20_000
 _WHOLE = 1 << 30
+EXCHANGED = "exchanged, x for y, they would: swap them, as QGIS does by Swap X and Y Coordinates"
 
 
 def list_sources(path: Path) -> list[Path]:
@@ -189,6 +190,8 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             _LOG.warning(
                 "%s: left out %s of %s features, which %s", name, f"{meta[key]:,}", f"{meta['features']:,}", what
             )
+    if "exchanged" in meta:
+        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", name, EXCHANGED)
     if "part" in meta:
         _LOG.warning("%s: %s", name, meta["part"])
     if "encoding" in meta:

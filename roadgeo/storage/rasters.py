@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_SIDE",
+    "RAW",
+    "name_page",
     "open_raster",
+    "page_of",
     "raster_size",
     "read_palette",
     "require_file",
@@ -72,6 +75,12 @@ _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the 
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
 _GEO_TEXT = 34737  # tag of GeoTIFF
+
+#: Endings of raw photographs, and tags of TIFF by which they are known: what of them GDAL reads is a thumbnail.
+RAW = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw")
+_DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE = 50706, 330, 254
+_CANON = b"CR"  # at byte 8
+_PAGE = re.compile(r"GTIFF_DIR:(\d+):(.+)", re.DOTALL)  # GDAL's name of a page
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
@@ -87,7 +96,8 @@ def open_raster(
     Parameters
     ----------
     path : path
-        A regular file, or a name in a GDAL file system (/vsizip/, /vsicurl/, ...) that the user typed.
+        A regular file, a page of one (see `name_page`), or a name in a GDAL file system (/vsizip/, /vsicurl/, ...) that
+        the user typed.
     name : str, optional
         Name for messages.
     is_ours : bool
@@ -106,6 +116,8 @@ def open_raster(
 
     name = name or os.fspath(path)
     remote = is_named_remote(path)
+    page = _PAGE.fullmatch(os.fspath(path)) if isinstance(path, str) else None
+    path = page[2] if page else path
     if not remote:
         require_file(path, name)
         if _is_array(path):
@@ -122,11 +134,14 @@ def open_raster(
             _require_boxes(Path(path), name)
         if drivers == ["PNG"]:
             _require_chunks(Path(path), name)
+        if page and drivers != ["GTiff"]:
+            raise MaskError(f"{name}: holds no pages; only TIFFs do: leave --page out")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             # Absolute, for a name may look like the text of a virtual raster, which GDAL takes in place of a path.
-            with _opened(os.fspath(path) if remote else str(Path(path).absolute()), drivers, remote) as dataset:
+            where = os.fspath(path) if remote else str(Path(path).absolute())
+            with _opened(f"GTIFF_DIR:{page[1]}:{where}" if page else where, drivers, remote) as dataset:
                 _require_plain(dataset, name)
                 orientation = _orientation(dataset, path, remote) if upright else UPRIGHT
                 if orientation == UPRIGHT:
@@ -239,6 +254,11 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"{name}: a GDAL virtual raster, which names other files to read: give those, "
             f"or set {CONSENT}=VRT if you trust it"
         )
+    if path.suffix.lower() in RAW or (driver == "GTiff" and _is_raw(path, head)):
+        raise MaskError(
+            f"{name}: a raw photograph ({path.suffix.lower()}), of which only a thumbnail could be read; develop it: "
+            "save it as JPEG or TIFF"
+        )
     if driver != "VRT" and re.search(rb"<(VRTDataset|MRF_META|GDAL_WMS)", head):
         raise MaskError(f"{name}: holds the text of a raster of another format; convert it to GeoTIFF if you trust it")
     if driver is None and not more:
@@ -251,6 +271,30 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
         )
     return [driver] if driver else more
+
+
+def _is_raw(path: Path, head: bytes) -> bool:
+    """Whether a TIFF is a camera's raw photograph, whatever its name: its first picture is a thumbnail."""
+    with path.open("rb") as file, contextlib.suppress(struct.error):
+        kind, subs, version = (
+            next(tiff_values(file, 0, tag), None) for tag in (_SUBFILE_TYPE, _SUB_IFDS, _DNG_VERSION)
+        )
+        is_thumbnail = kind is not None and int.from_bytes(kind[1][:4], "little" if kind[2] == "<" else "big") & 1
+        return head[8:10] == _CANON or version is not None or bool(is_thumbnail and subs)
+    return False
+
+
+def name_page(path: str, page: int | None) -> str:
+    """Return the name by which a page of a TIFF, counted from 1, is opened; without one the path itself."""
+    return path if page is None or _PAGE.fullmatch(path) else f"GTIFF_DIR:{page}:{Path(path).absolute()}"
+
+
+def page_of(dataset: DatasetReader) -> str:
+    """Return the page of a TIFF that is read, for people: "page 1 of 2"; "" where it has one."""
+    page, pages = _PAGE.fullmatch(dataset.name), [name for name in dataset.subdatasets if name.startswith("GTIFF_DIR:")]
+    if page:
+        return f"page {page[1]}"
+    return f"page 1 of {len(pages)}" if len(pages) > 1 else ""
 
 
 def _require_own_crs(path: Path, drivers: list[str], name: str) -> None:

@@ -1,5 +1,6 @@
 """Which masks are located, under which names, and what one bad mask costs."""
 
+import json
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -92,6 +93,24 @@ def test_no_two_results_have_one_name(masks: list[str]) -> None:
     for order in (masks, masks[::-1]):
         stems = [task.stem.casefold() for task in name_tasks(order)]
         assert len(set(stems)) == len(masks)
+
+
+def test_results_of_another_picture_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "x_location.json").write_text(json.dumps({"query": "a/x.png"}))
+
+    def stem(mask: str) -> str:
+        return name_tasks([mask], tmp_path)[0].stem
+
+    assert [stem(mask) for mask in ("a/x.png", "/data/a/x.png", "../a/x.png", "x.png", "b/y.png")] == [*"xxxxy"]
+    assert [stem(mask) for mask in ("b/x.png", "/data/b/x.png", "a/x.tif")] == ["b_x", "b_x", "a_x"]
+    (tmp_path / "b_x_location.json").write_text(json.dumps({"query": "b/x.png"}))
+    assert stem("b/x.png") == "b_x"
+    (tmp_path / "x_location.json").write_text("nonsense")
+    assert stem("b/x.png") == "x"
+
+
+def test_pages_have_results_of_their_own() -> None:
+    assert [task.stem for task in name_tasks(["a.tif", "GTIFF_DIR:2:/x/a.tif"])] == ["a", "a_page2"]
 
 
 def test_a_name_does_not_depend_on_the_order() -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 import xarray
@@ -12,7 +13,7 @@ from rasterio.io import MemoryFile
 from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
-from roadgeo.running.pictures import read_picture
+from roadgeo.running.pictures import pixels_of, read_picture
 
 GREY = np.arange(40 * 50, dtype=np.uint8).reshape(40, 50)
 RGB = np.stack([GREY, GREY + 1, GREY + 2], axis=-1)
@@ -109,3 +110,42 @@ def test_of_several_times_one_is_to_be_chosen() -> None:
     data = xarray.DataArray(RGB[None], dims=("time", "y", "x", "band"))
     with pytest.raises(MaskError, match="dimensions time, y, x, band; choose a time or level first"):
         read_picture(data)
+
+
+def axes(steps: tuple[float, float], **coords: object) -> dict[str, object]:
+    return {"y": 4e6 + steps[1] * np.arange(40), "x": 5e5 + steps[0] * np.arange(50), **coords}
+
+
+@pytest.mark.parametrize(
+    ("coords", "aspect", "mirror"),
+    [
+        (axes((1.0, -1.0)), None, "tell"),
+        (axes((1.0, 1.0)), None, "allow"),
+        (axes((1.5, -1.0)), 1.5, "tell"),
+        ({"y": np.arange(40), "x": np.arange(50)}, None, "tell"),  # numbers of pixels
+        ({"lat": 60 + 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, "allow"),
+        ({"lat": 60 - 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, "tell"),
+    ],
+)
+def test_the_shape_of_pixels_is_as_the_axes_state_it(
+    coords: dict[str, object], aspect: float | None, mirror: str
+) -> None:
+    known = pixels_of(xarray.DataArray(np.zeros((40, 50)), dims=tuple(coords), coords=coords))
+    assert known["mirror"] == mirror
+    assert known["aspect"] == (None if aspect is None else pytest.approx(aspect, rel=0.01))
+
+
+def test_a_crs_says_that_axes_are_degrees() -> None:
+    wkt = pyproj.CRS(4326).to_wkt()
+    coords = {"y": 60 - 1e-5 * np.arange(40), "x": 9 + 1e-5 * np.arange(50), "spatial_ref": ((), 0, {"crs_wkt": wkt})}
+    known = pixels_of(xarray.DataArray(np.zeros((40, 50)), dims=("y", "x"), coords=coords))
+    assert known["aspect"] == pytest.approx(0.5, rel=0.01)
+
+
+def test_names_of_bands() -> None:
+    bands = xarray.DataArray(np.zeros((2, 40, 50)), dims=("band", "y", "x"), coords={"band": ["road", "building"]})
+    assert pixels_of(bands)["names"] == ("road", "building")
+    assert pixels_of(bands.assign_coords(band=[1, 2])) == {"names": ()}
+    of_rioxarray = bands.assign_coords(band=[1, 2]).assign_attrs(long_name=("background", "road"))
+    assert pixels_of(of_rioxarray)["names"] == ("background", "road")
+    assert pixels_of(np.zeros((3, 4))) == {}

@@ -14,7 +14,7 @@ from worlds.turned import save_turned
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, transformer
-from roadgeo.sources.georeference import read_georeference
+from roadgeo.sources.georeference import read_georeference, read_pixel_shape
 
 PLACE = rasterio.Affine(0.5, 0.1, 330_000.0, 0.1, -0.5, 4_690_000.0)
 PLANE = LocalPlane("EPSG:32619", (330_000.0, 4_690_000.0))
@@ -146,3 +146,33 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
     middle = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform(*at(place, 40, 30))
     assert found.middle() == pytest.approx(middle, abs=1e-7)
     assert "EPSG:2" not in found.crs[:6]
+
+
+@pytest.mark.parametrize(
+    ("crs", "steps", "shape"),
+    [
+        ("EPSG:4326", (1e-5, -1e-5), (np.cos(np.radians(60)), False)),
+        ("EPSG:4326", (1e-5, 1e-5), (np.cos(np.radians(60)), True)),
+        ("EPSG:4326", (2e-5, -1e-5), (None, False)),
+        ("EPSG:32632", (1.0, -1.0), (None, False)),
+        ("EPSG:32632", (1.5, -1.0), (1.5, False)),
+        ("EPSG:32632", (1.0, 1.0), (None, True)),
+        ("EPSG:32632", (-1.0, 1.0), (None, False)),
+        ("EPSG:3857", (1.0, -1.0), (None, False)),
+        ("EPSG:4087", (1.0, -1.0), (np.cos(np.radians(60)), False)),  # plate carree
+    ],
+)
+def test_the_shape_of_pixels_is_as_the_file_states_it(tmp_path, crs, steps, shape) -> None:
+    x, y = transformer("EPSG:4326", crs).transform(9.0, 60.0)
+    path = write(tmp_path / "a.tif", crs=crs, transform=rasterio.Affine(steps[0], 0, x, 0, steps[1], y))
+    stretch, is_mirrored = read_pixel_shape(path)
+    assert is_mirrored is shape[1]
+    assert stretch == (None if shape[0] is None else pytest.approx(shape[0], rel=0.01))
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_files_that_state_no_shape_have_square_pixels(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
+    assert read_pixel_shape(tmp_path / "a.png") == (None, False)
+    assert read_pixel_shape(write(tmp_path / "a.tif")) == (None, False)
+    assert read_pixel_shape(write(tmp_path / "b.tif", transform=rasterio.Affine(0.5, 0, 0, 0, 0.7, 0))) == (None, False)

@@ -296,3 +296,20 @@ def test_counts_agree_with_an_independent_count(data_dir, name):
     counts = independent, int((noded.degree() >= 3).sum()), len(find_intersections(simplify(noded)))
     np.testing.assert_allclose(counts, REAL[name], rtol=0.003)
     assert 0.95 < counts[1] / independent < 1.12
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32619", "EPSG:2154", "EPSG:4258"])
+def test_exchanged_coordinates_are_mentioned(tmp_path, caplog, crs):
+    lon, lat = {"EPSG:32619": (-71.0, 42.3), "EPSG:2154": (2.3, 48.8), "EPSG:4258": (-8.6, 41.1)}[crs]
+    degrees = np.array([[lon, lat], [lon + 0.01, lat + 0.01], [lon + 0.02, lat]])
+    xy = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(*degrees.T)
+    right, wrong = (np.column_stack(pair) for pair in (xy, xy[::-1]))
+    for points, is_mentioned in ((right, False), (wrong, True)):
+        caplog.clear()
+        choose_roads([points], crs=crs)
+        assert ("exchanged, x for y, they would" in caplog.text) is is_mentioned
+
+
+def test_latitudes_beyond_the_pole_are_exchanged_longitudes():
+    with pytest.raises(CrsError, match="do not fit its CRS, EPSG:4326; exchanged, x for y, they would: swap them"):
+        choose_roads([np.array([[35.6, 139.7], [35.7, 139.8]])], crs=4326)

@@ -21,9 +21,9 @@ from worlds.turned import mark_turned, save_turned
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
-from roadgeo.sources.masks import read_mask
+from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import open_raster, raster_size, writing_raster
+from roadgeo.storage.rasters import name_page, open_raster, page_of, raster_size, writing_raster
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -494,3 +494,54 @@ def test_imagine_files_open_no_others(tmp_path: Path) -> None:
     (tmp_path / "a.img").touch()
     with pytest.raises(MaskError, match=r"names another file, 'a\.img'"), open_raster(tmp_path / "b.img"):
         pass
+
+
+# --- raw photographs, and pages ---------------------------------------------------------------------------------------
+
+
+def tiff_tags(path: Path, *entries: tuple[int, int, int, int], canon: bool = False) -> Path:
+    """Write a TIFF whose first directory has these entries: tag, type, count, value."""
+    at = 16
+    head = struct.pack("<2sHI", b"II", 42, at) + (b"CR\2\0" if canon else b"").ljust(8, b"\0")
+    rows = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    path.write_bytes(head + struct.pack("<H", len(entries)) + rows + bytes(4))
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.DNG", "a.nef", "a.cr3", "dng.tif", "nef.tif", "cr2.tif"])
+def test_raw_photographs_are_refused_by_name(tmp_path: Path, name: str) -> None:
+    entries = {"dng.tif": [(50706, 1, 4, 1)], "nef.tif": [(254, 4, 1, 1), (330, 4, 1, 8)]}.get(name, [(256, 4, 1, 64)])
+    with pytest.raises(MaskError, match=r"a raw photograph .*thumbnail could be read; develop it: save it as"):
+        read_mask(tiff_tags(tmp_path / name, *entries, canon=name == "cr2.tif"))
+
+
+def test_a_pyramid_is_no_raw_photograph(tmp_path: Path) -> None:
+    path = tiff_tags(tmp_path / "a.tif", (254, 4, 1, 0), (330, 4, 1, 8))
+    with pytest.raises(MaskError, match="not a raster that can be read"):
+        read_mask(path)
+
+
+def two_pages(path: Path) -> tuple[Path, np.ndarray]:
+    roads = np.zeros((80, 100), np.uint8)
+    cv2.line(roads, (0, 20), (100, 30), 255, 5)
+    cv2.line(roads, (40, 0), (30, 80), 255, 5)
+    pages = [PIL.Image.fromarray(image) for image in (roads[::-1].copy(), roads)]
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    return path, roads
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_pages_of_a_tiff(tmp_path: Path) -> None:
+    path, roads = two_pages(tmp_path / "pages.tif")
+    for page, right in ((None, roads[::-1]), (1, roads[::-1]), (2, roads)):
+        with open_mask(name_page(str(path), page)) as opened:
+            assert opened.part == ("page 1 of 2" if page is None else f"page {page}")
+            np.testing.assert_array_equal(opened.read(opened.thresholds[0]).roads, right > 0)
+    assert raster_size(name_page(str(path), 2)) == (100, 80)
+    with pytest.raises(MaskError, match=r"pages\.tif: not a raster that can be read"):
+        read_mask(name_page(str(path), 3))
+    cv2.imwrite(str(tmp_path / "a.png"), roads)
+    with pytest.raises(MaskError, match="holds no pages"):
+        read_mask(name_page(str(tmp_path / "a.png"), 2))
+    with open_raster(tmp_path / "a.png") as dataset:
+        assert page_of(dataset) == ""

@@ -13,7 +13,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
-from roadgeo.storage.rasters import MAX_SIDE, open_raster, read_palette
+from roadgeo.storage.rasters import MAX_SIDE, open_raster, page_of, read_palette
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -42,12 +42,15 @@ class Photograph:
     read : callable
         `read(left, top, width, height, shape)` returns this part of it, in its own pixels, as (H, W, 3) uint8 RGB of
         the given shape (H, W), and as (H, W) bool where it is not nodata.
+    page : str
+        Of a file with several, for people.
     """
 
     name: str
     width: int
     height: int
     read: Callable[[float, float, float, float, tuple[int, int]], tuple[AnyArray, BoolArray]]
+    page: str = ""
 
 
 @contextmanager
@@ -79,7 +82,7 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
             values, valid = _read(dataset, chosen, (left, top, width, height), shape)
             return stretch(values), valid
 
-        yield Photograph(name, dataset.width, dataset.height, read)
+        yield Photograph(name, dataset.width, dataset.height, read, page_of(dataset))
 
 
 def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
