@@ -66,8 +66,8 @@ N_LAID = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
-#: Where traced roads and the picture favour the same place, this part of the lesser lead counts as well, for they are
-#: not independent; where they favour different places, it counts against.
+#: Where traced roads and a soft picture favour the same place, this part of the lesser lead counts as well, for they
+#: are not independent, and in a drawn mask they are the same; where they favour different places, it counts against.
 _AGREEING = 0.5
 #: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
 #: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
@@ -145,7 +145,7 @@ class Rivals:
         seen = self._by_picture(estimator)
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
-        agreeing = _AGREEING if estimator.same(best.model, other.model) else -1.0
+        agreeing = _AGREEING * is_soft if estimator.same(best.model, other.model) else -1.0
         best = best._replace(log10_lead=best.log10_lead + agreeing * max(other.log10_lead, 0.0))
         if best.rival is None or best.model is by_roads.model or is_soft:
             return best
