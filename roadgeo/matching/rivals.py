@@ -8,8 +8,9 @@ that explains more becomes the best place, and is compared in its turn.
 The lead has two parts: the pieces of the query that favour the place over the best rival (see
 `Evidence.compared_with`), and the gap between its likelihood and the rivals' (`log10_gap`).
 
-Where traced roads do not decide, the picture does (see `picture`): a soft one shows more than the roads that were
-traced in it. Its rivals are the places that were met, and all shifts and turns of the place around.
+Where traced roads do not decide, a soft picture does, for it shows more than the roads that were traced in it, and any
+picture where hints exclude most rivals (see `picture`). Its rivals are the places that were met, and all shifts and
+turns of the place around.
 """
 
 from __future__ import annotations
@@ -138,8 +139,8 @@ class Rivals:
         """Compare the likeliest place of a part with its best rival; return None if no place was verified."""
         by_roads, estimator = self._by_roads(part), self.estimators[part]
         is_soft = estimator.scene.probability is not None
-        clear = _CERTAIN if is_soft or estimator.anywhere is not None else self.needed
-        if by_roads is None or by_roads.log10_lead >= clear or time.perf_counter() > self._deadline:
+        may_decide = (is_soft or estimator.anywhere is not None) and time.perf_counter() <= self._deadline
+        if by_roads is None or by_roads.log10_lead >= _CERTAIN or not may_decide:
             return by_roads
         started = time.perf_counter()
         seen = self._by_picture(estimator)
