@@ -67,7 +67,7 @@ class Raster:
     all_bands : tuple of str
         The same of all bands.
     page : str
-        Of a file with several, for people.
+        Page of a file with several, for people.
     has_alpha : bool
         Values are valid where they are not transparent.
     model_threshold : float or None

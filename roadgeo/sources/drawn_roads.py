@@ -8,16 +8,17 @@ from __future__ import annotations
 import logging
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._arrays import FloatArray
 from roadgeo._text import visible
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import choose_plane, from_lonlat
 from roadgeo.storage.crs import known_crs
 
 __all__ = ["Drawing", "Units", "draw_roads"]
@@ -77,14 +78,17 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
     if "part" in read.meta:
         _LOG.warning("%s: %s", visible(name), read.meta["part"])
     import shapely
+    from rasterio.features import rasterize
 
-    rings, area = shapely.get_parts(shapely.boundary(read.areas), return_index=True)  # outlines and holes
     is_drawn = len(read.lines) > 0
-    coords, owner = shapely.get_coordinates(read.lines if is_drawn else rings, return_index=True)
+    shapes = read.lines if is_drawn else read.areas
+    coords = shapely.get_coordinates(shapes)
     kind = _tell_units(name, coords, read.crs) if units == "auto" else units
     degrees = kind == "degrees"
     if degrees:
-        coords = _to_metres(coords)
+        plane = choose_plane(coords)
+        shapes = shapely.transform(shapes, partial(from_lonlat, plane))
+        coords = shapely.get_coordinates(shapes)
     # The lines' plane with y up: rows of a picture count downwards.
     downwards = kind == "pixels" and coords[:, 1].max() > 0
     flip = np.diag([1.0, -1.0, 1.0]) if not downwards else np.eye(3)
@@ -98,8 +102,9 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
     to_pixel = shift @ np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ flip
     width, height = np.ceil((high - low) / unit).astype(int) + 2 * _MARGIN_PX
     road = _ROAD_PX if kind == "pixels" else float(np.clip(_ROAD_M / unit, 4.0, 12.0))
-    pixels, size = coords @ to_pixel[:2, :2].T + to_pixel[:2, 2], (int(width), int(height))
-    roads = _draw(pixels, owner, size, round(road)) if is_drawn else _fill(pixels, owner, area, size)
+    shapes = shapely.transform(shapes, lambda xy: xy @ to_pixel[:2, :2].T + to_pixel[:2, 2])
+    shapes = shapely.buffer(shapes, road / 2.0, quad_segs=2) if is_drawn else shapes
+    roads = rasterize(shapes, (int(height), int(width)), dtype=np.uint8).view(np.bool_)
     mask = RoadMask(roads, name=name)
     return Drawing(mask, None if degrees else to_pixel, None if kind == "pixels" else unit, degrees)
 
@@ -117,32 +122,3 @@ def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixe
     if high[1] <= 0:
         return "pixels"
     raise MaskError(f"{name}: does not say what its coordinates are; give --units pixels or --units metres")
-
-
-def _to_metres(lonlat: FloatArray) -> FloatArray:
-    """Take degrees to metres of a plane around them."""
-    from roadgeo.geometry.projection import choose_plane, from_lonlat
-
-    return from_lonlat(choose_plane(lonlat), lonlat)
-
-
-def _draw(pixels: FloatArray, owner: IntArray, size: tuple[int, int], width: int) -> BoolArray:
-    """Draw lines (corner convention; `owner` numbers them) as (H, W) bool."""
-    canvas = np.zeros(size[::-1], np.uint8)
-    cv2.polylines(canvas, _each_line(pixels, owner), False, 255, max(width, 1), cv2.LINE_8, 4)
-    return np.asarray(canvas > 0)
-
-
-def _fill(pixels: FloatArray, owner: IntArray, area: IntArray, size: tuple[int, int]) -> BoolArray:
-    """Fill polygons but for their holes (corner convention; `owner` numbers rings, `area` is theirs) as (H, W) bool."""
-    canvas = np.zeros(size[::-1], np.uint8)
-    rings = _each_line(pixels, owner)
-    for first, last in zip(*(np.searchsorted(area, np.unique(area), side) for side in ("left", "right")), strict=True):
-        cv2.fillPoly(canvas, rings[first:last], 255, cv2.LINE_8, 4)
-    return np.asarray(canvas > 0)
-
-
-def _each_line(pixels: FloatArray, owner: IntArray) -> list[IntArray]:
-    """Return lines as OpenCV takes them, in sixteenths of a pixel."""
-    fixed = np.round((pixels - 0.5) * 16.0).astype(np.int32)
-    return np.split(fixed, np.flatnonzero(np.diff(owner)) + 1)

@@ -12,6 +12,7 @@ __all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
+_FOCAL = "EXIF_FocalLengthIn35mmFilm"
 
 
 def read_focal_length(path: str | os.PathLike[str]) -> float:
@@ -22,9 +23,7 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     MaskError
         The file cannot be read, or has no focal length.
     """
-    with open_raster(path, upright=False) as source:
-        tags = {**source.tags(), **source.tags(ns="EXIF")}
-    stated = tags.get("EXIF_FocalLengthIn35mmFilm", "").strip("() ")
+    stated = _tags(path)[0].get(_FOCAL, "").strip("() ")
     focal = _number(stated)
     if not 1.0 <= focal <= 5000.0:
         raise MaskError(
@@ -50,19 +49,22 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
     The height above the place of take-off, which drones note (XMP "RelativeAltitude"), is better than EXIF
     "GPSAltitude", which counts from the sea. None where either is missing.
     """
-    with open_raster(path, upright=False) as source:
-        longer_side: int = max(source.shape)
-        try:
-            tags = {**source.tags(), **source.tags(ns="EXIF")}
-            xmp = "".join(source.tags(ns="xml:XMP").values())
-        except UnicodeDecodeError:  # damaged
-            return None
-    focal = _number(tags.get("EXIF_FocalLengthIn35mmFilm", ""))
+    try:
+        tags, xmp = _tags(path)
+    except UnicodeDecodeError:  # damaged
+        return None
+    focal = _number(tags.get(_FOCAL, ""))
     relative = re.search(r"RelativeAltitude\W{1,4}([-+]?\d+(\.\d+)?)", xmp)
     height = _number(relative[1]) if relative else _number(tags.get("EXIF_GPSAltitude", ""))
     if not (1.0 <= focal <= 5000.0 and 5.0 <= height <= 100_000.0):
         return None
-    return height * FILM_WIDTH_MM / focal / longer_side
+    return height * FILM_WIDTH_MM / focal / max(raster_size(path))
+
+
+def _tags(path: str | os.PathLike[str]) -> tuple[dict[str, str], str]:
+    """Return a photograph's tags, with EXIF's, and its XMP."""
+    with open_raster(path, upright=False) as source:
+        return {**source.tags(), **source.tags(ns="EXIF")}, "".join(source.tags(ns="xml:XMP").values())
 
 
 def _number(text: str) -> float:

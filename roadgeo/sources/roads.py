@@ -22,7 +22,7 @@ from roadgeo.errors import CrsError, NoRoadsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, to_plane
 from roadgeo.roads.kinds import RoadKind, drives
 from roadgeo.sources.containers import held_table
-from roadgeo.sources.lines import RoadLines, cut_lines
+from roadgeo.sources.lines import RoadLines, cut_lines, objects
 from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
 from roadgeo.sources.schemas import recognise
 from roadgeo.sources.streams import EXCHANGED, list_sources, read_lines, tell_source
@@ -308,16 +308,11 @@ def as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) ->
     """Join columns to (L,) text, "" where nothing is known; None where no source knows any."""
     if all(column is None for column in columns):
         return None
-    text = np.full(sum(len(source.lines) for source in sources), "", object)
-    start = 0
-    for column, source in zip(columns, sources, strict=True):
-        for i, value in enumerate(() if column is None else column, start):
-            if isinstance(value, str):
-                text[i] = value
-            elif isinstance(value, Iterable):
-                text[i] = ";".join(map(str, value))
-        start += len(source.lines)
-    return text
+    held = [np.full(len(source.lines), None) if c is None else c for c, source in zip(columns, sources, strict=True)]
+    return objects(
+        value if isinstance(value, str) else ";".join(map(str, value)) if isinstance(value, Iterable) else ""
+        for value in np.concatenate(held)
+    )
 
 
 def _corners(source: RoadLines) -> FloatArray:

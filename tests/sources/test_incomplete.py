@@ -67,16 +67,16 @@ PARTS = {
 
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_of_an_answer_is_mentioned_as_one(tmp_path, caplog, name):
-    content, told = PARTS[name]
+    content, mention = PARTS[name]
     path = tmp_path / name
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with caplog.at_level(logging.WARNING):
         assert len(read_roads(path)) > 0
     assert "says that it is not whole" in caplog.text
-    assert told in caplog.text
+    assert mention in caplog.text
     caplog.clear()
     draw_roads(path)
-    assert told in caplog.text
+    assert mention in caplog.text
 
 
 @pytest.mark.parametrize(

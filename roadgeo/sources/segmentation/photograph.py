@@ -43,7 +43,7 @@ class Photograph:
         `read(left, top, width, height, shape)` returns this part of it, in its own pixels, as (H, W, 3) uint8 RGB of
         the given shape (H, W), and as (H, W) bool where it is not nodata.
     page : str
-        Of a file with several, for people.
+        Page of a file with several, for people.
     """
 
     name: str
