@@ -100,7 +100,7 @@ def _summary(location: Location) -> str:
     if location.rotation_deg is not None:
         parts.append(f"up is {round(location.rotation_deg) % 360}°")
     if location.log10_odds is not None:
-        parts.append(f"score {location.log10_odds:.1f}")
+        parts.append(f"score {location.log10_odds:z.1f}")
     return "   ·   ".join(parts)
 
 

@@ -40,7 +40,7 @@ def choose_place(location: Location, options: LocateOptions) -> Location:
         frame,
         query=location.query,
         status="chosen",
-        reason=f"chosen by you: place {number} of {len(places)}; the score is {odds:.1f},"
+        reason=f"chosen by you: place {number} of {len(places)}; the score is {odds:z.1f},"
         f" {options.min_log10_odds:g} is asked for",
         reason_code=Reason.CHOSEN,
         log10_odds=odds,

@@ -55,7 +55,9 @@ def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd
     assert (found["status"], found["reason_code"], found["error_rate"]) == ("chosen", "chosen", None)
     score = min(listed[n - 1].log10_odds, listed[0].log10_odds)
     assert found["log10_odds"] == pytest.approx(score)
-    assert found["reason"] == (f"chosen by you: place {n} of {len(listed)}; the score is {score:.1f}, 3.5 is asked for")
+    assert found["reason"] == (
+        f"chosen by you: place {n} of {len(listed)}; the score is {score:z.1f}, 3.5 is asked for"
+    )
     off = np.array(found["footprint_lonlat"]) - listed[n - 1].footprint_lonlat
     assert np.abs(off).max() < 0.001
     others = [place["center"]["lon"] for place in found["alternatives"]]

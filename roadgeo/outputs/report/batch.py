@@ -132,7 +132,7 @@ def _item(entry: Entry, with_folder: bool) -> str:
         if sigma:
             parts.append(f"corners {write_sigma(max(sigma))}")
         if odds is not None:
-            parts.append(f"score {odds:.1f}")
+            parts.append(f"score {odds:z.1f}")
     text = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
     return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{text}</small></li>"

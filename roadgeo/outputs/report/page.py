@@ -324,7 +324,7 @@ def _numbers(subject: Shown) -> list[tuple[str, str]]:
         middle, worst = np.percentile(location.evidence.residual_m, (50, 100))
         rows.append(("Residuals", f"median {write_distance(middle)}, largest {write_distance(worst)}"))
     if location.log10_odds is not None:
-        rows.append(("Score", f"{location.log10_odds:.1f} <small>(powers of ten ahead of any other place)</small>"))
+        rows.append(("Score", f"{location.log10_odds:z.1f} <small>(powers of ten ahead of any other place)</small>"))
     rows.append(("Time", f"{location.seconds.total - location.seconds.write:.2f} s"))
     return rows
 
