@@ -47,7 +47,7 @@ def print_steps(quiet: bool) -> Say:
             last = text, -1
         if as_json and share is not None and int(100 * share) != last[1]:
             last = text, int(100 * share)
-            echo(json.dumps({"progress": {"done": last[1], "total": 100, "text": text}}), err=True)
+            _print_json(last[1], 100, text)
 
     return say
 
@@ -89,7 +89,9 @@ def count_up(
     """
     counts: Counter[str] = Counter()
     if os.environ.get("ROADGEO_PROGRESS") == "json":
-        show: AbstractContextManager[Callable[[str], None]] = nullcontext(_print_counts(total))
+        show: AbstractContextManager[Callable[[str], None]] = nullcontext(
+            lambda text: _print_json(counts.total(), total, text)
+        )
     elif quiet or total < 2 or not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
         show = nullcontext(lambda _: None)
     else:
@@ -103,16 +105,8 @@ def count_up(
         yield count
 
 
-def _print_counts(total: int) -> Callable[[str], None]:
-    """Return a function that prints one more of `total` as a line of JSON."""
-    done = 0
-
-    def tell(text: str) -> None:
-        nonlocal done
-        done += 1
-        echo(json.dumps({"progress": {"done": done, "total": total, "text": text}}), err=True)
-
-    return tell
+def _print_json(done: int, total: int, text: str) -> None:
+    echo(json.dumps({"progress": {"done": done, "total": total, "text": text}}), err=True)
 
 
 @contextmanager

@@ -274,9 +274,7 @@ def _is_same_motion(a: FloatArray, b: FloatArray, frame: Frame) -> bool:
 
 def _shared(motion: FloatArray, frame: Frame) -> float:
     """Return the share of a frame that the other one sees, too."""
-    side = np.linspace(0.05, 0.95, 10)
-    grid = np.stack(np.meshgrid(side * frame.width, side * frame.height), axis=-1).reshape(-1, 2)
-    there = Homography(motion).facing(frame.center)(grid)
+    there = Homography(motion).facing(frame.center)(frame.grid(10, 0.05))
     return float(((there > 0) & (there < (frame.width, frame.height))).all(axis=1).mean())
 
 

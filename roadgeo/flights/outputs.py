@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from html import escape
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -83,18 +84,14 @@ def _ring(row: Row) -> list[list[float]]:
 
 def to_gpx(rows: Sequence[Row]) -> str:
     """Return the track (GPX 1.1); it is broken where the flight was lost."""
-    segments: list[list[str]] = [[]]
-    for row in rows:
-        if row.center is None:
-            if segments[-1]:
-                segments.append([])
-            continue
+
+    def point(row: Row) -> str:
+        lon, lat = row.center or (math.nan, math.nan)
         when = "" if row.time is None else f"<time>{row.to_dict()['time']}</time>"
-        segments[-1].append(
-            f'<trkpt lat="{row.center[1]:.8f}" lon="{row.center[0]:.8f}">{when}'
-            f"<name>{escape(row.name)}</name><type>{row.status}</type></trkpt>"
-        )
-    body = "".join(f"<trkseg>{''.join(points)}</trkseg>" for points in segments if points)
+        about = f"{when}<name>{escape(row.name)}</name><type>{row.status}</type>"
+        return f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}">{about}</trkpt>'
+
+    body = "".join(f"<trkseg>{''.join(map(point, run))}</trkseg>" for run in _runs(rows, 1))
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="roadgeo {__version__}" '
         f'xmlns="http://www.topografix.com/GPX/1/1"><trk><name>flight</name>{body}</trk></gpx>\n'
@@ -120,7 +117,7 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
               draw_fill("228,87,46,25", "228,87,46", 0.3)),
         Layer("centers", "POINT", centers, columns, "EPSG:4326", draw_marker("228,87,46", 2.0)),
     ]  # fmt: skip
-    runs = _runs(rows)
+    runs = _runs(rows, 2)
     if runs:
         ends = {"first": [run[0].number for run in runs], "last": [run[-1].number for run in runs]}
         lines = [np.array([row.center for row in run]) for run in runs]
@@ -128,15 +125,10 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
     write_layers(path, layers)
 
 
-def _runs(rows: Sequence[Row]) -> list[list[Row]]:
-    """Return runs of two frames and more that have places."""
-    runs: list[list[Row]] = [[]]
-    for row in rows:
-        if row.center is None:
-            runs.append([])
-        else:
-            runs[-1].append(row)
-    return [run for run in runs if len(run) > 1]
+def _runs(rows: Sequence[Row], least: int) -> list[list[Row]]:
+    """Return runs of frames that have places, of at least so many."""
+    runs = [list(run) for is_placed, run in groupby(rows, lambda row: row.center is not None) if is_placed]
+    return [run for run in runs if len(run) >= least]
 
 
 def _text(make: Callable[[Sequence[Row]], str]) -> Callable[[Path, Sequence[Row]], None]:

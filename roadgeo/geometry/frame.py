@@ -24,6 +24,16 @@ class Frame:
         """(4, 2) pixel positions of the corners TL, TR, BR, BL."""
         return np.array([[0.0, 0.0], [self.width, 0.0], [self.width, self.height], [0.0, self.height]])
 
+    def grid(self, n: int, margin: float = 0.0) -> FloatArray:
+        """Return (n * n, 2) pixel positions on a grid over the frame, but for a margin that is a share of each side."""
+        along = np.linspace(margin, 1.0 - margin, n)
+        return np.stack(np.meshgrid(along * self.width, along * self.height), axis=-1).reshape(-1, 2)
+
+    def outline(self, n: int = 8) -> FloatArray:
+        """Return (4 n, 2) pixel positions along the sides, clockwise from the top left corner."""
+        corners = self.corners
+        return np.linspace(corners, np.roll(corners, -1, axis=0), n, endpoint=False, axis=1).reshape(-1, 2)
+
     @property
     def center(self) -> FloatArray:
         """(2,) pixel position of the middle."""

@@ -97,9 +97,7 @@ class Georeference:
 
     def control_points(self) -> tuple[FloatArray, FloatArray]:
         """Return (25, 2) pixel positions all over the raster and where they lie in its CRS."""
-        width, height = self.size
-        columns, rows = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
-        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        pixels = Frame(*self.size).grid(_GRID)
         return pixels, self._there(pixels)
 
     def _there(self, pixels: FloatArray) -> FloatArray:

@@ -74,7 +74,7 @@ def _write_vrt(path: Path, subject: Subject, folder: Path) -> None:
             root.remove(element)
     wkt = known_crs(subject.place.crs).to_wkt("WKT1_GDAL")
     points = ET.Element("GCPList", Projection=wkt)
-    for i, (column, row, x, y) in enumerate(subject.stored_control_points()):
+    for i, (column, row, x, y) in enumerate(subject.control_points()):
         where = {"Id": str(i + 1), "Pixel": repr(column), "Line": repr(row), "X": repr(x), "Y": repr(y)}
         ET.SubElement(points, "GCP", where)
     root.insert(0, points)
@@ -92,7 +92,7 @@ def _from_here(picture: Path, folder: Path) -> tuple[str, str]:
 
 def write_points(path: Path, subject: Subject) -> None:
     """Write control points for the QGIS Georeferencer, whose projective transformation reproduces the homography."""
-    path.write_text(georeferencer_points(subject.place.crs, subject.stored_control_points()), encoding="utf-8")
+    path.write_text(georeferencer_points(subject.place.crs, subject.control_points()), encoding="utf-8")
 
 
 def georeferencer_points(crs: str, points: Iterable[Sequence[float]]) -> str:
@@ -139,7 +139,7 @@ def write_odm(path: Path, subject: Subject) -> None:
     """Write control points as OpenDroneMap's gcp_list.txt; the map knows no heights, so all are 0."""
     lines = [_odm_crs(subject.place.crs)]
     name = name_for_odm(subject.picture.name)
-    lines += [f"{x!r} {y!r} 0 {column!r} {row!r} {name}" for column, row, x, y in subject.stored_control_points()]
+    lines += [f"{x!r} {y!r} 0 {column!r} {row!r} {name}" for column, row, x, y in subject.control_points()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

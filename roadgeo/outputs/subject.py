@@ -164,19 +164,11 @@ class Subject:
         """From the picture's pixels to its file's, where that is to be turned (see `storage.orientation`)."""
         return Homography(stored_from_upright(read_orientation(self.picture), self.size))
 
-    def stored_control_points(self) -> list[tuple[float, float, float, float]]:
-        """As `control_points`, in the pixels of the picture's file: of programs that do not turn it."""
-        points = np.array(self.control_points())
-        return [tuple(point) for point in np.c_[self.stored(points[:, :2]), points[:, 2:]].tolist()]
-
-    def control_points(self) -> list[tuple[float, float, float, float]]:
-        """Column, row, x, y of 25 points on a grid over the picture."""
-        columns, rows = np.meshgrid(np.linspace(0, self.size[0], _GRID), np.linspace(0, self.size[1], _GRID))
-        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-        lens = self.place.lens(self.size)
+    def control_points(self) -> list[list[float]]:
+        """Column, row, x, y of 25 points on a grid over the picture, in the pixels of its file as they are stored."""
+        pixels, lens = Frame(*self.size).grid(_GRID), self.place.lens(self.size)
         straight = pixels if lens is None else lens.straighten(pixels)
-        points: list[tuple[float, float, float, float]]
-        points = [tuple(point) for point in np.hstack([pixels, Homography(self.homography)(straight)]).tolist()]
+        points: list[list[float]] = np.hstack([self.stored(pixels), Homography(self.homography)(straight)]).tolist()
         return points
 
     def matches(self) -> list[Match]:
@@ -203,7 +195,4 @@ class Subject:
         """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""
         from roadgeo.geometry.projection import to_lonlat
 
-        corners = Frame(*self.size).corners[[0, 3, 2, 1]]
-        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-        pixels = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in sides])
-        return to_lonlat(self.place.crs, Homography(self.homography)(pixels))
+        return to_lonlat(self.place.crs, Homography(self.homography)(Frame(*self.size).outline()[::-1]))

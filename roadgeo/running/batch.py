@@ -19,6 +19,7 @@ import numpy as np
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError, name_package
+from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
@@ -381,11 +382,7 @@ def _on_ground(location: Location, dem: str) -> Camera | None:
         return location.camera
     from roadgeo.sources.elevation import ground_heights
 
-    width, height = location.size
-    columns, rows = np.meshgrid(np.linspace(0.05, 0.95, 7) * width, np.linspace(0.05, 0.95, 7) * height)
-    heights = ground_heights(
-        dem, location.pixel_to_map(np.stack([columns, rows], axis=-1).reshape(-1, 2)), location.crs
-    )
+    heights = ground_heights(dem, location.pixel_to_map(Frame(*location.size).grid(7, 0.05)), location.crs)
     known = heights[np.isfinite(heights)]
     if not len(known):
         return location.camera

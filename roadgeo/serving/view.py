@@ -7,7 +7,6 @@ import json
 import pickle
 import re
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError, OutputError
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
@@ -130,19 +130,13 @@ def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
             for a, b, residual in zip(seen, there, matches.residual_m, strict=True)
             if np.isfinite([*a, *b]).all()
         ]
+    outline = Frame(*shown.size).outline()
     return {
-        "outline": _rounded(lay(_outline(shown.size)), 7),
+        "outline": _rounded(lay(np.vstack([outline, outline[:1]])), 7),
         "warped": _draw_on_map(folder / WARPED, shown, place),
         "roads": [_rounded(line, 7) for line in roads],
         "matches": values,
     }
-
-
-def _outline(size: tuple[int, int]) -> FloatArray:
-    """Return (33, 2) pixels along the frame's sides, from its top left and back."""
-    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], float) * size
-    sides = [np.linspace(a, b, 8, endpoint=False) for a, b in pairwise(corners)]
-    return np.concatenate([*sides, corners[:1]])
 
 
 def _draw_on_map(path: Path, shown: Shown, place: Placement) -> list[list[float]] | None:
