@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -212,6 +211,7 @@ def locate(
     ValueError
         A hint makes no sense; `near` lies on no map, but would with longitude and latitude exchanged.
     """
+    from roadgeo.running.batch import changed_options
     from roadgeo.running.choosing import choose_place
     from roadgeo.running.looks import Sighting
     from roadgeo.running.options import ReadOptions
@@ -244,7 +244,8 @@ def locate(
         sighting = Sighting(choose_place(locate_mask(mask, references, options), options), mask)
     else:
         sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
-    origin = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
+    changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
+    origin = {"options": changed, "reference_digest": _digest(references, sighting.location)}
     found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
     indexes = tuple(item.index_of(sighting.location) for item in references)
     picture = picture if sighting.of_photograph else None
@@ -418,16 +419,6 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
 
 def _hint(name: str, value: Any) -> Any:
     return None if value is None else read_hint(name, value)[1]
-
-
-def _told(options: LocateOptions) -> dict[str, Any]:
-    """Return the options that differ from the usual ones, as the command line writes them down."""
-    from roadgeo.running.batch import changed_options
-
-    plain: dict[str, Any] = json.loads(
-        json.dumps(changed_options(replace(options, truths=(), threads=1), LocateOptions()), default=repr)
-    )
-    return plain
 
 
 def _digest(references: Sequence[AnyReference], location: Location) -> str:

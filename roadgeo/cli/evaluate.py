@@ -180,9 +180,7 @@ def _evaluate(
     started = time.perf_counter()
     try:
         with count_up(len(queries), quiet) as count:
-            trials = run_trials(
-                queries, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
-            )
+            trials = run_trials(queries, locator, jobs, record, settings, count)
     except KeyboardInterrupt:
         if record is not None:
             echo(f"{_recorded(record)} of {len(queries)} masks are kept; the same command goes on.", err=True)

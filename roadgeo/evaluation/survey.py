@@ -90,14 +90,7 @@ class Survey:
         if self.out_dir is not None:
             record = self.out_dir / f"{self.reference.stem}{LOCALIZABILITY}_trials_{part}.jsonl"
         with self.counting(len(masks)) as count:
-            return run_trials(
-                masks,
-                self.locator,
-                self.jobs,
-                record,
-                self.settings,
-                lambda trial: count(trial.answer["status"].replace("_", " ")),
-            )
+            return run_trials(masks, self.locator, self.jobs, record, self.settings, count)
 
     def summarize(self, found: LocalizabilityMap) -> dict[str, Any]:
         """Return the area of each class, and how many of the test masks were located there."""

@@ -175,6 +175,11 @@ class Trial:
     truth: Truth
     answer: Answer
 
+    @property
+    def status(self) -> str:
+        """Status in the answer, in words."""
+        return str(self.answer["status"]).replace("_", " ")
+
 
 def run_trials(
     queries: QuerySet,
@@ -182,7 +187,7 @@ def run_trials(
     jobs: int = 1,
     record: Path | None = None,
     settings: Mapping[str, Any] | None = None,
-    progress: Callable[[Trial], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> list[Trial]:
     """Locate every query.
 
@@ -196,7 +201,7 @@ def run_trials(
     settings : mapping, optional
         Plain values that identify this run.
     progress : callable, optional
-        Called with every trial, the recorded ones too, in order.
+        Called with the status in every answer, the recorded ones too, in order.
 
     Raises
     ------
@@ -205,15 +210,13 @@ def run_trials(
     """
     done = [] if record is None else _read_record(record, dict(settings or {}))
     for trial in done:
-        if progress:
-            progress(trial)
+        progress(trial.status)
     pending = range(len(done), len(queries))
     for trial in run(pending, _Trying(queries, locator), jobs) if pending else ():
         if record is not None:
             _append(record, trial)
         done.append(trial)
-        if progress:
-            progress(trial)
+        progress(trial.status)
     return done
 
 

@@ -68,10 +68,7 @@ def wanted_outputs(names: Iterable[str], on_map: bool, has_photo: bool, has_came
     PluginError
         There is no such output.
     """
-    wanted = [*ALWAYS, *find_outputs(names)]
-    wanted = [
-        output for output in wanted if (on_map or not output.needs_place) and (has_camera or not output.needs_camera)
-    ]
+    wanted = (output for output in (*ALWAYS, *find_outputs(names)) if output.suits(on_map, has_camera))
     return [output for output in wanted if not (output is STYLE and has_photo)]
 
 

@@ -67,6 +67,10 @@ class Output:
     option: str = ""
     needs_camera: bool = False
 
+    def suits(self, on_map: bool, has_camera: bool) -> bool:
+        """Whether a result has it, that is drawn on the map or not, and whose camera is known or not."""
+        return (on_map or not self.needs_place) and (has_camera or not self.needs_camera)
+
     def path(self, folder: Path, stem: str, picture: str = "") -> Path:
         """Name the file."""
         return folder / (self.ending.replace("{picture}", picture) if "{" in self.ending else stem + self.ending)

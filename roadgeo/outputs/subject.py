@@ -195,4 +195,5 @@ class Subject:
         """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""
         from roadgeo.geometry.projection import to_lonlat
 
-        return to_lonlat(self.place.crs, Homography(self.homography)(Frame(*self.size).outline()[::-1]))
+        pixels = np.roll(Frame(*self.size).outline()[::-1], 1, axis=0)  # from the top left corner, still
+        return to_lonlat(self.place.crs, Homography(self.homography)(pixels))

@@ -49,7 +49,7 @@ def read_location(path: str | os.PathLike[str]) -> Location:
     try:
         document = _read_document(Path(path))
         location = None if document.get("homography") is None else _from_document(document)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (CrsError, OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise MaskError(
             f"{name}: no location ({error}); give the *_location.json that `roadgeo locate` wrote"
         ) from error
@@ -76,7 +76,7 @@ def _from_document(document: dict[str, Any]) -> Location:
     homography = _array(document["homography"], (3, 3))
     footprint = _array(document["footprint"], (4, 2))
     _require_one_place(homography, footprint, (width, height))
-    crs, place = _crs(str(document["crs"])), _place(document)
+    crs, place = name_crs(str(document["crs"])), _place(document)
     sigma, covariance = document.get("corner_sigma_m"), document.get("corner_covariance_m2")
     return Location(
         str(document["query"]),
@@ -112,14 +112,6 @@ def _require_one_place(homography: FloatArray, footprint: FloatArray, size: tupl
         raise ValueError("the homography does not lead to the footprint")
     if not _GSD_M[0] <= side / np.sqrt(size[0] * size[1]) <= _GSD_M[1]:
         raise ValueError(f"a frame of {side:g} m")
-
-
-def _crs(name: str) -> str:
-    """Return a CRS as every library reads it."""
-    try:
-        return name_crs(name)
-    except CrsError as error:
-        raise ValueError(str(error)) from error
 
 
 def _place(document: dict[str, Any]) -> Place:

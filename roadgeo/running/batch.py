@@ -210,14 +210,12 @@ class Locating:
         """Return the options that differ from the defaults, as plain values for the JSON."""
         usual = BatchOptions()
         reading = replace(self.options.reading, threads=ReadOptions.threads)
-        changes = {
+        return {
             **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
             **changed_options(reading, usual.reading),
             **{name: value for name in ("exif", "dem") if (value := getattr(self.options, name))},
             **changed_options(self.outputs.image, usual.outputs.image),
         }
-        plain: dict[str, Any] = json.loads(json.dumps(changes))
-        return plain
 
     def do(self, task: Task, asked: Asked, how: Locate | None = None) -> Outcome:
         """Locate one mask and write its results; the one place where what goes wrong with a mask is caught."""
@@ -352,7 +350,9 @@ class Asked:
 
 def changed_options(options: Any, usual: Any) -> dict[str, Any]:
     """Return the fields of options that differ from the usual ones as plain values; of nested ones likewise."""
-    return _changed(dataclasses.asdict(options), dataclasses.asdict(usual))
+    changed = _changed(dataclasses.asdict(options), dataclasses.asdict(usual))
+    plain: dict[str, Any] = json.loads(json.dumps(changed, default=repr))
+    return plain
 
 
 def _changed(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:

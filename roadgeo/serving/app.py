@@ -204,7 +204,7 @@ class Service:
         offered = [
             {"name": output.name, "summary": output.summary, "href": f"jobs/{job.id}/files/{output.name}"}
             for output in OFFERED.values()
-            if document and (on_map or not output.needs_place) and (camera or not output.needs_camera)
+            if document and output.suits(on_map, camera)
         ]
         return JSONResponse({"files": offered})
 

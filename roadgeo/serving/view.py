@@ -97,10 +97,8 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
         location, mask, of_photograph = pickle.load(file)  # noqa: S301
     folder = path.parent.with_name(_OUTPUTS)
     output, paths = OFFERED[name], output_paths(folder, path.stem)
-    if output.needs_place and not location.on_map:
-        raise OutputError("there is no place on the map to show")
-    if output.needs_camera and location.camera is None:
-        raise OutputError("no camera above the ground would see the frame so")
+    if not output.suits(location.on_map, location.camera is not None):
+        raise OutputError("there is no place on the map to show, or no camera above the ground would see the frame so")
     indexes = [reference.index_of(location) for reference in references]
     subject = Subject(
         location, mask, paths, ImageOptions(max_pixels=64_000_000), path if of_photograph else None, indexes

@@ -346,6 +346,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     from roadgeo.running.queries import locate_query
     from roadgeo.serving.view import OWN, SEEN, write_view
     from roadgeo.sources.exif import focal_in_pixels
+    from roadgeo.storage.rasters import raster_size
     from roadgeo.workflows import LocateOptions, locate
 
     def search(*asked_of: Any) -> Any:
@@ -355,7 +356,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     def tell(text: str, share: float | None = None) -> None:
         say(_without(asked.path, text), share)
 
-    width, height = _size(asked.path)
+    width, height = raster_size(asked.path)
     if width * height > asked.max_pixels:
         detail = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
         return Answer(413, {"detail": detail})
@@ -388,13 +389,6 @@ def _write(asked: Asked, references: Sequence[Any]) -> Answer:
     from roadgeo.serving.view import write_output
 
     return Answer(200, {"file": str(write_output(Path(asked.path), asked.wanted, references))})
-
-
-def _size(path: str) -> tuple[int, int]:
-    """Return (width, height) of an image without unpacking it."""
-    from roadgeo.storage.rasters import raster_size
-
-    return raster_size(path)
 
 
 def _without(path: str, message: str) -> str:
