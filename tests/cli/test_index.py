@@ -45,25 +45,6 @@ def test_a_place_becomes_a_reference_in_the_library(osm, tmp_path, capsys):
     assert "2022-05-04T19:30:42Z" in json.dumps(output)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--osm", "Atlantis"), "OpenStreetMap knows no such place"),
-        (("--osm", "Gas Lamp"), "is a point on OpenStreetMap, not an area"),
-    ],
-)
-def test_places_that_cannot_be_indexed(osm, tmp_path, capsys, arguments, message):
-    assert index(*arguments, osm=osm) == 1
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.rglob("*.gpkg"))
-
-
-def test_a_busy_server_is_waited_for_and_said(osm, capsys):
-    osm.overpass.append((429, {"Retry-After": "3"}, b"busy"))
-    assert index("--bbox=-71.0925,42.3445,-71.08,42.3525", osm=osm) == 0
-    assert "is busy (429), asking again in a minute" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("answer", ["cut", (200, {}, EMPTY), (500, {}, b"<html>")], ids=["cut", "empty", "broken"])
 def test_answers_of_no_use_are_an_error_on_one_line(osm, tmp_path, capsys, answer):
     osm.overpass.append(answer)
@@ -110,18 +91,6 @@ def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys,
     assert capsys.readouterr().out.splitlines()[0].split() == ["name", name]
     assert main(["info", str(reference), "--json"]) == 0
     assert "a.geojson" in json.dumps(json.loads(capsys.readouterr().out)["meta"]["sources"])
-
-
-def test_roads_without_a_crs_are_an_error(tmp_path, capsys):
-    file = write_streets(tmp_path / "a.shp")
-    file.with_suffix(".prj").unlink()
-    assert index("--roads", file, "--out", tmp_path / "a.gpkg") == 1
-    assert "name it, for example --crs EPSG:26986" in capsys.readouterr().err
-    assert index("--roads", file, "--crs", "EPSG:4326", "--out", tmp_path / "a.gpkg") == 0
-
-
-WEST, EAST = "--bbox=-71.11,42.34,-71.0865,42.36", "--bbox=-71.0870,42.34,-71.07,42.36"
-INNER = "--bbox=-71.09,42.345,-71.084,42.35"
 
 
 def counts(reference, capsys):
@@ -203,10 +172,3 @@ def test_the_next_command_is_named(tmp_path, monkeypatch, capsys):
     assert "search it with `roadgeo locate MASK -r maps/b.gpkg`" in capsys.readouterr().out
     assert main(["index", "--roads", "a.geojson", "--name", "Fenway, MA"]) == 0
     assert "search it with `roadgeo locate MASK -r fenway-ma`" in capsys.readouterr().out
-
-
-def test_a_box_with_exchanged_degrees_is_asked_about(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    write_streets(tmp_path / "a.geojson")
-    assert main(["index", "--roads", "a.geojson", "--bbox=42.3,-71.2,42.4,-71", "--out", "b.gpkg"]) == 1
-    assert "longitude comes first: did you mean --bbox=-71.2,42.3,-71,42.4?" in capsys.readouterr().err

@@ -67,8 +67,7 @@ def road_mask() -> RoadMask:
     return RoadMask(roads, name="photo_mask.png")
 
 
-@pytest.mark.parametrize("resolution_m", [None, 0.5, 2.0])
-@pytest.mark.parametrize("unobserved", [False, True])
+@pytest.mark.parametrize(("resolution_m", "unobserved"), [(None, False), (None, True), (0.5, True), (2.0, False)])
 def test_the_warped_mask_agrees_with_the_homography(
     tmp_path: Path, resolution_m: float | None, unobserved: bool
 ) -> None:

@@ -44,11 +44,6 @@ def test_whom_to_name_is_kept(roads, tmp_path):
     assert open_reference(tmp_path / "fenway.gpkg").name == "fenway"
 
 
-def test_a_table_without_a_crs_is_refused(roads):
-    with pytest.raises(CrsError, match="has no CRS; name it"):
-        build_reference(roads.set_crs(None, allow_override=True))
-
-
 def held(kind, roads):
     """The same roads as a program may hold them, and what else it then says."""
     lines, coordinates = list(roads.geometry), [np.array(line.coords) for line in roads.geometry]

@@ -64,4 +64,4 @@ def test_masks_are_located_where_they_lie_and_nowhere_else(data_dir, boston):
     assert np.median(errors) <= 1.5
     assert max(errors) < 10.0
     assert not any("view 0" in name for name in refused)
-    assert len(refused) <= 0.06 * n_present
+    assert len(refused) <= 0.09 * n_present
