@@ -170,13 +170,13 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
 def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
     """Label and value of the main properties."""
     meta, counts = described.get("meta", {}), described.get("counts", {})
-    size = sum(described["files"].values())
+    size, crs = sum(described["files"].values()), str(described.get("crs"))
     lines = [
         ("name", str(described["name"])),
         ("files", ", ".join(described["files"])),
         ("size", f"{size / 1e6:.1f} MB"),
         ("state", _STATES[described["freshness"]]),
-        ("CRS", _crs_text(str(described.get("crs")))),
+        ("CRS", crs.split('"')[1] if '"' in crs else crs),  # of a plane of our own the name, first in its WKT2
         ("intersections", f"{counts.get('intersections', 0):,}"),
         *([("roads", _road_text(described))] if "roads" in counts else []),
     ]
@@ -219,11 +219,6 @@ _STATES = {
     "no GeoPackage": "ready; the GeoPackage is missing",
     "shards missing": "shards are missing; `roadgeo index --shards` builds them again",
 }
-
-
-def _crs_text(crs: str) -> str:
-    """Return a code as it is, and of a plane of our own the name that stands first in its WKT2."""
-    return crs.split('"')[1] if '"' in crs else crs
 
 
 def _road_text(described: dict[str, Any]) -> str:

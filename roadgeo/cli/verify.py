@@ -93,8 +93,8 @@ def verify_command(
     from roadgeo.cli.progress import count_up, print_steps
     from roadgeo.outputs.verification_files import write_table
     from roadgeo.running.batch import open_references
+    from roadgeo.running.processes import run
     from roadgeo.running.tasks import find_masks, name_tasks
-    from roadgeo.running.verifying import verify_images
 
     found = find_masks(images, given["recursive"])
     if not found:
@@ -107,7 +107,7 @@ def verify_command(
         make_folder(out_dir)
     results: list[Verified] = []
     with count_up(len(tasks), quiet, as_json) as count:
-        for task, verified in zip(tasks, verify_images(tasks, settings, jobs), strict=True):
+        for task, verified in zip(tasks, run(tasks, settings, jobs), strict=True):
             results.append(verified)
             count(verified.verdict)
             stem = Path(out_dir) / task.stem

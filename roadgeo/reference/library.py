@@ -6,7 +6,6 @@ import difflib
 import os
 import re
 import shutil
-import sys
 import unicodedata
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from roadgeo.reference.network_file import not_a_reference
 from roadgeo.reference.remote import fetch_manifest, is_remote
 from roadgeo.reference.shards import ENDING, manifest_path
 from roadgeo.storage.files import make_folder, writing
+from roadgeo.storage.folders import user_dir
 
 __all__ = [
     "library_dir",
@@ -34,13 +34,7 @@ def library_dir() -> Path:
     given = os.environ.get("ROADGEO_LIBRARY")
     if given:
         return Path(given).expanduser()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Application Support"
-    else:
-        base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
-    return base / "roadgeo" / "references"
+    return user_dir("Application Support", "XDG_DATA_HOME", ".local/share") / "roadgeo" / "references"
 
 
 def make_slug(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,6 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
-from roadgeo.running.processes import run
 from roadgeo.running.queries import locate_query
 from roadgeo.running.tasks import Task
 from roadgeo.sources.georeference import read_georeference
@@ -34,7 +33,7 @@ from roadgeo.sources.georeference import read_georeference
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference
 
-__all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image", "verify_images"]
+__all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image"]
 
 SCHEMA = "roadgeo.verification/1"
 
@@ -73,11 +72,6 @@ class VerifyRun:
     def give_up(self, task: Task, reason: str) -> Verified:
         """Make the outcome of an image that could not be worked on."""
         return _failed(task.mask, reason)
-
-
-def verify_images(tasks: Sequence[Task], settings: VerifyRun, jobs: int = 1) -> Iterator[Verified]:
-    """Verify images in one process or several; yield the result of each, in their order."""
-    return run(tasks, settings, jobs)
 
 
 def verify_image(image: str, references: Sequence[AnyReference], settings: VerifyRun | None = None) -> Verified:

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-__all__ = ["cache_dir", "is_private", "private_temporary_dir", "writable"]
+__all__ = ["cache_dir", "is_private", "private_temporary_dir", "user_dir", "writable"]
 
 #: Names of a temporary folder to try before making one that no other process will find.
 _NAMES = 16
@@ -28,11 +28,17 @@ def cache_dir() -> Path:
     given = os.environ.get("ROADGEO_CACHE")
     if given:
         return Path(given).expanduser()
+    own = user_dir("Caches", "XDG_CACHE_HOME", ".cache") / "roadgeo"
+    return own / "cache" if sys.platform == "win32" else own
+
+
+def user_dir(on_mac: str, variable: str, usual: str) -> Path:
+    """Folder of the user's files of one kind: in Windows' local data, macOS's Library, or as XDG's variable says."""
     if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "roadgeo" / "cache"
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "roadgeo"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "roadgeo"
+        return Path.home() / "Library" / on_mac
+    return Path(os.environ.get(variable) or Path.home() / usual)
 
 
 def private_temporary_dir() -> Path:
