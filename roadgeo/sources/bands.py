@@ -76,9 +76,8 @@ class Raster:
 
     name: str
     shape: tuple[int, int]
-    n_bands: int
     read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
-    bands: tuple[str, ...] = ()
+    bands: tuple[str, ...]
     all_bands: tuple[str, ...] = ()
     has_alpha: bool = False
     is_chosen: bool = False
@@ -134,7 +133,7 @@ def _of_array(array: AnyArray, choice: Choice, name: str) -> Raster:
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
     bands = tuple(labels[i] for i in chosen)
-    return Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, bands, labels, is_chosen=is_chosen)
+    return Raster(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen)
 
 
 def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Raster:
@@ -176,7 +175,7 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
     size, own = (dataset.height, dataset.width), _model_threshold(dataset)
-    return Raster(name, size, len(bands), read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
+    return Raster(name, size, read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
 
 
 def _model_threshold(dataset: DatasetReader) -> float | None:

@@ -164,7 +164,7 @@ def open_mask(
             raise MaskError(
                 f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads"
             )
-        channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
+        channel = int(np.argmax(seen.std(axis=0)))
         sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
         refuse_different_bands(sample)
         if threshold is None:
@@ -192,7 +192,7 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
     """
     share = len(seen) / (len(seen) + len(hidden))
     if raster.has_alpha and 0 < share <= _MAX_ROAD_SHARE and not seen.any():
-        return replace(raster, read=_where(raster, True), n_bands=1)
+        return replace(raster, read=_where(raster, True), bands=raster.bands[:1])
     middle, valid = _middle(raster)
     shown = ~_finite(middle, valid)
     edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
@@ -200,7 +200,7 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
         return raster
     if (seen == seen[0]).all():
         _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", visible(raster.name))
-        return replace(raster, read=_where(raster, False), n_bands=1)
+        return replace(raster, read=_where(raster, False), bands=raster.bands[:1])
     is_lightest = seen.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > seen.max()
     if not is_lightest or len(np.unique(seen)) <= 2:
         return raster
@@ -225,7 +225,7 @@ def _of_class(raster: Raster, number: int) -> Raster:
     MaskError
         There are none of them, or several bands.
     """
-    if raster.n_bands > 1:
+    if len(raster.bands) > 1:
         raise MaskError(f"{raster.name}: has several bands; choose the one that holds the classes: {raster.options}")
     classes = np.unique(_sample(raster)[0])
     if number not in classes:
@@ -315,7 +315,7 @@ def _between(raster: Raster, channel: int, ground: float, road: float) -> AnyArr
 def _strips(raster: Raster, step: int) -> Iterator[slice]:
     """Cut the rows into strips that are read at a time, each of a multiple of `step` rows."""
     height, width = raster.shape
-    rows = step * max(1, _STRIP_PIXELS // (width * raster.n_bands * step))
+    rows = step * max(1, _STRIP_PIXELS // (width * len(raster.bands) * step))
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 
