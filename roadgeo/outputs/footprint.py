@@ -72,21 +72,12 @@ def _write_mask(path: Path, subject: Subject) -> None:
     from roadgeo.storage.rasters import writing_raster
 
     grid = subject.grid
-    size = grid.resolution
-    profile = {
-        "driver": "MEM",
-        "width": grid.width,
-        "height": grid.height,
-        "count": 1,
-        "dtype": "uint8",
-        "nodata": OUTSIDE,
-        "crs": subject.crs,
-        "transform": rasterio.Affine(size, 0.0, grid.west, 0.0, -size, grid.north),
-    }
+    kind = {"driver": "MEM", "width": grid.width, "height": grid.height, "count": 1, "dtype": "uint8"}
+    place = {"crs": subject.crs, "transform": rasterio.Affine(*grid.to_crs_matrix()[:2].ravel().tolist())}
     with ExitStack() as stack:
         stack.enter_context(writing_raster(path))
         optimized = stack.enter_context(rasterio.MemoryFile(ext="tif"))
-        plain = stack.enter_context(rasterio.open("", "w", **profile))
+        plain = stack.enter_context(rasterio.open("", "w", **kind, **place, nodata=OUTSIDE))
         plain.write(warp_mask(subject)[None])
         plain.write_colormap(1, {value: (*rgb(color), 255) for value, (color, _, _) in PALETTE.items()})
         plain.update_tags(**_tags(subject))

@@ -325,21 +325,11 @@ def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) 
     """Return the creation options of a GeoTIFF; one without CRS is an overview of `size` (width, height)."""
     grid = plan.grid
     width, height = size or (grid.width, grid.height)
-    profile: dict[str, Any] = {
-        "driver": "GTiff",
-        "width": width,
-        "height": height,
-        "count": len(plan.colors),
-        "dtype": plan.dtype.name,
-        "tiled": True,
-        "blockxsize": 512,
-        "blockysize": 512,
-        "interleave": "pixel",
-        "sparse_ok": True,
-        "bigtiff": "IF_SAFER",
-    }
+    profile: dict[str, Any] = {"driver": "GTiff", "width": width, "height": height, "count": len(plan.colors)}
+    profile |= {"dtype": plan.dtype.name, "interleave": "pixel", "sparse_ok": True, "bigtiff": "IF_SAFER"}
+    profile |= {"tiled": True, "blockxsize": 512, "blockysize": 512}
     if crs is not None:
-        transform = rasterio.Affine(grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north)
+        transform = rasterio.Affine(*grid.to_crs_matrix()[:2].ravel().tolist())
         profile |= {"crs": crs, "transform": transform, "nodata": plan.nodata}
     return profile
 

@@ -53,7 +53,7 @@ def write_stac(path: Path, subject: Subject) -> None:
             "gsd": location.gsd_m,
             **projection,
             "proj:shape": [grid.height, grid.width],
-            "proj:transform": [grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north, 0.0, 0.0, 1.0],
+            "proj:transform": grid.to_crs_matrix().ravel().tolist(),
             **own,
         },
         "links": [],

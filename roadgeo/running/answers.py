@@ -120,7 +120,7 @@ class Answer(Location):
         grid, values = subject.grid, warp_mask(subject)
         x = grid.west + grid.resolution * (np.arange(grid.width) + 0.5)
         y = grid.north - grid.resolution * (np.arange(grid.height) + 0.5)
-        transform = (grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north)
+        transform = tuple(grid.to_crs_matrix()[:2].ravel().tolist())
         about = {"crs": subject.crs, "transform": transform, "query": self.query, "attribution": subject.attribution}
         return xr.DataArray(values, {"y": y, "x": x}, ("y", "x"), name="road", attrs=about)
 
