@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 
 from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.geometry.pinhole import View
@@ -66,8 +67,15 @@ class Landscape:
         if ((points < low) | (points > high)).any():
             return False
         # Rings may be holes of one another: inside is where an odd number of them goes around.
-        inside = sum((_in_ring(points, ring) for ring in self.coverage), np.zeros(len(points), int))
+        inside = shapely.contains_xy(self._rings, *points.T).sum(axis=0)
         return not self.coverage or bool((inside % 2 == 1).all())
+
+    @cached_property
+    def _rings(self) -> AnyArray:
+        """(R, 1) polygons of `coverage`."""
+        rings = np.array([shapely.Polygon(ring) for ring in self.coverage], object).reshape(-1, 1)
+        shapely.prepare(rings)
+        return rings
 
 
 @dataclass(frozen=True)
@@ -150,12 +158,3 @@ def visible_intersections(landscape: Landscape, view: View, margin_px: float = 1
     pixels = pixels[inside]
     _, first = np.unique(np.floor(pixels / 14.0), axis=0, return_index=True)
     return pixels[np.sort(first)]
-
-
-def _in_ring(points: FloatArray, ring: FloatArray) -> IntArray:
-    """(K,) 1 for points inside a closed ring, by counting the sides that a ray to the east crosses."""
-    x, y = points[:, 0, None], points[:, 1, None]
-    (x0, y0), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
-    return np.asarray(crossed.sum(axis=1) % 2)
