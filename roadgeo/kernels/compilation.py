@@ -252,7 +252,7 @@ def modules_of_the_search() -> list[str]:
 
 
 def modules_of_maps() -> list[str]:
-    """Names of the modules whose kernels a map needs, of those of the search."""
+    """Names of the search's modules whose kernels a map needs."""
     return [f"roadgeo.kernels.{name}" for name in _MAPS]
 
 
@@ -333,7 +333,7 @@ def load(modules: Sequence[str] | None = None, progress: Progress | None = None)
 
 @contextlib.contextmanager
 def _without_collection() -> Iterator[None]:
-    """Keep all objects meanwhile: to search for cycles among those of a compiler takes a tenth of its time."""
+    """Keep all objects meanwhile: a compiler spends a tenth of its time on the search for cycles."""
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -174,7 +174,7 @@ class Picture:
         return sorted(found, key=lambda peak: -peak.worth)
 
     def _fine_cell_m(self, matrix: FloatArray) -> float:
-        """Return the cells by which a place is weighed, metres: none is finer than those of the reduced frame."""
+        """Return the cells by which a place is weighed, metres, no finer than the reduced frame's."""
         return max(_ROAD_M / 2.0, self.scene.field_scale * sampling(matrix, self.scene.size))
 
     def _around(self, matrix: FloatArray, cell_m: float, reach_m: float) -> Ground:
