@@ -224,7 +224,7 @@ def refuse_different_bands(sample: Sample) -> None:
         return
     shares = (seen - seen.min(axis=0))[:, shown] / span[shown]
     is_crisp = (np.minimum(shares, 1.0 - shares) < _CRISP_SHARE).mean(axis=0) > 1.0 - _CRISP_SHARE
-    if shares.shape[1] > 2 and not is_crisp.any() and shares.sum(axis=1).std() > _FAINT:
+    if shares.shape[1] > 2 and not is_crisp.any() and seen.sum(axis=1).std() > _FAINT * seen.std(axis=0).sum():
         return
     first = shares[:, np.argmax(is_crisp)]
     roads = min(np.mean(first > 0.5), np.mean(first <= 0.5))

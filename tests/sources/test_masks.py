@@ -674,6 +674,14 @@ def test_a_class_is_chosen(tmp_path: Path, roads: np.ndarray, houses: np.ndarray
         open_mask(path, choice=Choice(road_class=7)).__enter__()
 
 
+def test_a_pale_photograph_with_a_few_bright_pixels_is_no_stack_of_classes() -> None:
+    pale = (np.moveaxis(ground(), 0, 2) // 4 + 90).astype(np.uint8)
+    pale[np.random.default_rng(0).random(SHAPE) < 0.002] = 255
+    pale[10:12, 10:12] = (255, 0, 0)
+    with pytest.raises(PhotographError):
+        read_mask(pale)
+
+
 # --- nodata that is the roads' value ----------------------------------------------------------------------------------
 
 
