@@ -126,7 +126,7 @@ def index_command(
     if not quiet:
         seconds = perf_counter() - started
         found = f"{path}: {counted(len(reference.index), 'intersection')} in {seconds:.1f} s"
-        echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
+        echo(f"{found}; search it with `roadgeo locate photo.jpg -r {out or path.stem}`")
 
 
 def _kinds_of_coarse(in_shards: bool) -> str:

@@ -337,8 +337,18 @@ def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single:
     echo(describe(outcome), err=as_json)
     if verbose:
         echo(_details(outcome.document), err=as_json)
+    if single and outcome.status in ("not_located", "ambiguous"):
+        _list_places(outcome.document, as_json)
     if (single or verbose) and outcome.files:
         echo("  wrote " + visible(", ".join(outcome.files)), err=as_json)
+
+
+def _list_places(document: dict[str, Any], as_json: bool) -> None:
+    """Print the places that a refusal knows, by the numbers that --take has for them."""
+    places = [*([document["center"]] if document["center"] else []), *(p["center"] for p in document["alternatives"])]
+    if places:
+        listed = ", ".join(f"{n}: {format_lonlat(at['lon'], at['lat'])}" for n, at in enumerate(places, 1))
+        echo(f"  best places, {listed}; where you know one to be right, --take its number", err=as_json)
 
 
 def _details(document: dict[str, Any]) -> str:

@@ -90,4 +90,4 @@ def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: 
         entries = reference.manifest.filled
         n = sum(entry.own_intersections for entry in entries)
         found = f"{path}: {n:,} intersections in {len(entries)} shards in {perf_counter() - started:.1f} s"
-        echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
+        echo(f"{found}; search it with `roadgeo locate photo.jpg -r {out or path.stem}`")

@@ -169,6 +169,6 @@ def test_the_next_command_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
     write_streets(tmp_path / "a.geojson")
     assert main(["index", "--roads", "a.geojson", "--out", "maps/b.gpkg"]) == 0
-    assert "search it with `roadgeo locate MASK -r maps/b.gpkg`" in capsys.readouterr().out
+    assert "search it with `roadgeo locate photo.jpg -r maps/b.gpkg`" in capsys.readouterr().out
     assert main(["index", "--roads", "a.geojson", "--name", "Fenway, MA"]) == 0
-    assert "search it with `roadgeo locate MASK -r fenway-ma`" in capsys.readouterr().out
+    assert "search it with `roadgeo locate photo.jpg -r fenway-ma`" in capsys.readouterr().out

@@ -12,6 +12,7 @@ from roadgeo.errors import NotLocatedError
 from roadgeo.evaluation import scoring
 from roadgeo.evaluation.demo import demo_masks
 from roadgeo.evaluation.truth import Truth
+from roadgeo.outputs.wording import format_lonlat
 
 MASKS = {mask.path.stem: str(mask.path) for mask in demo_masks()}
 LOCATE = ["locate", MASKS["elsewhere"], "--effort", "quick"]
@@ -43,6 +44,14 @@ def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused)
         corners = np.array(place["footprint_lonlat"])
         assert corners.shape == (4, 2)
         assert np.abs(corners.mean(axis=0) - (place["center"]["lon"], place["center"]["lat"])).max() < 0.02
+
+
+def test_a_refusal_shows_the_places_by_their_numbers(porto, refused, capfd):
+    assert main(["locate", MASKS["elsewhere"], "-r", str(porto)]) == 3
+    (listed,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("  best places, 1: ")]
+    second = refused.alternatives[1]
+    assert f", 2: {format_lonlat(second.lon, second.lat)}, 3: " in listed
+    assert listed.endswith("; where you know one to be right, --take its number")
 
 
 @pytest.mark.parametrize("n", [1, 2])
