@@ -215,27 +215,22 @@ def _clear(xy: FloatArray) -> BoolArray:
 def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.01) -> FloatArray:
     """Fit a logistic regression with an intercept, (T, F) features to (T,) outcomes; (1 + F,) weights.
 
-    Newton's method on standardized features, whose weights are drawn to 0 by `ridge`: without that, trials that all
-    went the same way would have no finite optimum.
+    The weights of standardized features are drawn to 0 by `ridge`: without that, trials that all went the same way
+    would have no finite optimum.
     """
+    from scipy.optimize import minimize
+
     mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-9
     design = np.column_stack([np.ones(len(features)), (features - mean) / scale])
-    penalty = ridge * np.ones(design.shape[1])
+    signs = np.where(located, -1.0, 1.0)
 
     def loss(weights: FloatArray) -> float:
-        signs = np.where(located, 1.0, -1.0)
-        return float(np.logaddexp(0.0, -signs * (design @ weights)).sum() + (penalty * weights**2).sum() / 2)
+        return float(np.logaddexp(0.0, signs * (design @ weights)).sum() + ridge * (weights @ weights) / 2)
 
-    weights = np.zeros(design.shape[1])
-    for _ in range(100):
-        p = _logistic(design @ weights)
-        curvature = (design.T * (p * (1 - p))) @ design + np.diag(penalty)
-        step = np.linalg.solve(curvature, design.T @ (located - p) - penalty * weights)
-        while loss(weights + step) > loss(weights) and np.abs(step).max() > 1e-9:
-            step = step / 2
-        weights = weights + step
-        if np.abs(step).max() < 1e-6:
-            break
+    def slope(weights: FloatArray) -> FloatArray:
+        return np.asarray(design.T @ (_logistic(design @ weights) - located) + ridge * weights)
+
+    weights = minimize(loss, np.zeros(design.shape[1]), jac=slope, method="BFGS").x
     return np.concatenate(([weights[0] - (weights[1:] * mean / scale).sum()], weights[1:] / scale))
 
 

@@ -225,7 +225,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
             _add_up(counts, chosen.meta)
             crs = crs or chosen.crs
             if spool is None:
-                spool = Spool(folder, _cell_size(str(crs), options))
+                spool = Spool(folder, (options.size_m or _CELL_M) / (_metres(str(crs)) or _DEGREE_M))
             if chosen.crs != crs and crs != "EPSG:4326":
                 return None
             with writing(folder):
@@ -271,10 +271,6 @@ def _metres(crs: str) -> float | None:
     """Return the metres of a unit of a CRS; None for degrees."""
     known = known_crs(crs)
     return float(known.axis_info[0].unit_conversion_factor) if known.is_projected else None
-
-
-def _cell_size(crs: str, options: ShardOptions) -> float:
-    return (options.size_m or _CELL_M) / (_metres(crs) or _DEGREE_M)
 
 
 def _coarse_box(boxes: Sequence[ShardBox]) -> ShardBox:

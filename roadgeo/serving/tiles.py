@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.areas import Box
-from roadgeo.geometry.projection import from_lonlat, to_lonlat, transformer
+from roadgeo.geometry.projection import from_lonlat, to_lonlat, transform
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import join_segments
 from roadgeo.reference.reference import AnyReference
@@ -69,7 +69,7 @@ class Tiles:
         box = to_lonlat("EPSG:3857", corners)
         (box_west, box_south), (box_east, box_north) = box.tolist()
         indexes = _indexes(reference, (box_west, box_south, box_east, box_north), zoom)
-        ends = np.concatenate([np.empty((0, 2, 2)), *(_web(index, _segments(index, box)) for index in indexes)])
+        ends = np.concatenate([np.empty((0, 2, 2)), *map(partial(_on_web, box=box), indexes)])
         to_tile = _EXTENT / side * np.array([1.0, -1.0])
         streets = [] if zoom < MAX_ZOOM else [street for index in indexes for street in _named(index.path, corners)]
         named = [((line - (west, north)) * to_tile, name) for line, name in streets]
@@ -109,10 +109,10 @@ def _segments(index: ReferenceIndex, box: FloatArray) -> AnyArray:
     return np.asarray(index.segments[np.unique(np.concatenate(parts))])
 
 
-def _web(index: ReferenceIndex, segments: AnyArray) -> FloatArray:
-    """Take segments (S, 4) of a plane to the CRS of web maps: (S, 2, 2)."""
-    en = index.plane.to_crs(segments.reshape(-1, 2))
-    return np.stack(transformer(index.plane.crs, "EPSG:3857").transform(en[:, 0], en[:, 1]), axis=1).reshape(-1, 2, 2)
+def _on_web(index: ReferenceIndex, box: FloatArray) -> FloatArray:
+    """Return the ends (S, 2, 2) of a map's segments near a box, in the CRS of web maps."""
+    ends = _segments(index, box).reshape(-1, 2, 2)
+    return transform(index.plane.crs, "EPSG:3857", index.plane.to_crs(ends))
 
 
 def _draw(ends: FloatArray, zoom: int) -> list[FloatArray]:
@@ -161,8 +161,7 @@ def _streets(path: str) -> tuple[STRtree, AnyArray]:
     names = layer.columns.get("name", np.empty(len(shapes), object))
     has_name = np.array([bool(name) for name in names], bool)
     lines = shapely.from_wkb(shapes[has_name])
-    to_web = transformer(str(layer.crs), "EPSG:3857").transform
-    on_web = shapely.transform(lines, lambda xy: np.column_stack(to_web(*xy.T)))
+    on_web = shapely.transform(lines, partial(transform, str(layer.crs), "EPSG:3857"))
     return shapely.STRtree(on_web), names[has_name]
 
 
