@@ -10,7 +10,8 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from roadgeo.evaluation.landscape import Landscape, Strokes, visible_intersections, visible_strokes
-from roadgeo.geometry.pinhole import View, polygon_area
+from roadgeo.geometry.frame import polygon_area
+from roadgeo.geometry.pinhole import View
 
 __all__ = ["NOISE_MODELS", "NoiseModel", "draw_mask"]
 

@@ -16,7 +16,8 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.evaluation.landscape import Landscape, visible_intersections
 from roadgeo.evaluation.noise import NoiseModel, Range, draw_mask
 from roadgeo.evaluation.truth import Truth
-from roadgeo.geometry.pinhole import View, make_view, polygon_area, sees_ground
+from roadgeo.geometry.frame import polygon_area
+from roadgeo.geometry.pinhole import View, make_view, sees_ground
 
 __all__ = [
     "SimulatedQuery",

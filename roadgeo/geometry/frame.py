@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 
-__all__ = ["Frame"]
+__all__ = ["Frame", "polygon_area"]
 
 
 @dataclass(frozen=True)
@@ -57,3 +57,9 @@ class Frame:
     def plane_center(self) -> FloatArray:
         """(2,) the middle on the query plane: y up."""
         return self.center * (1.0, -1.0)
+
+
+def polygon_area(corners: FloatArray) -> float:
+    """Compute the area of a simple polygon (K, 2), whichever way round it goes, closed or not."""
+    x, y = (corners - corners.mean(axis=0)).T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2

@@ -11,7 +11,7 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 
-__all__ = ["View", "make_view", "polygon_area", "sees_ground", "warp_mask"]
+__all__ = ["View", "make_view", "sees_ground", "warp_mask"]
 
 #: A ray further than this from the vertical meets the ground too far away to be worth drawing.
 MAX_RAY_DEG = 85.0
@@ -114,12 +114,6 @@ def warp_mask(
     source = np.linalg.inv(half) @ matrix @ half
     warped = cv2.warpPerspective(mask, source, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return np.where(warped > 127, 255, 0).astype(np.uint8), matrix
-
-
-def polygon_area(corners: FloatArray) -> float:
-    """Compute the area of a polygon (K, 2), whichever way round it goes."""
-    x, y = corners.T
-    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
 
 
 def _camera_homography(

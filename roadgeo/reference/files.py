@@ -15,6 +15,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, OutputError
+from roadgeo.geometry.frame import polygon_area
 from roadgeo.reference.index_file import (
     FORMAT_VERSION,
     dump_index,
@@ -28,7 +29,6 @@ from roadgeo.reference.network_file import (
     network_digest,
     read_meta,
     read_network,
-    ring_area,
     stored_digest,
 )
 from roadgeo.roads.intersections import Intersections
@@ -261,7 +261,7 @@ def identities(path: str | os.PathLike[str]) -> list[tuple[int, int] | None]:
 def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
     """Describe a network and its index for people, in plain values."""
     found, graph = network.intersections, network.graph
-    area_km2 = sum(map(ring_area, network.coverage)) / 1e6
+    area_km2 = sum(map(polygon_area, network.coverage)) / 1e6
     low, high = (graph.coords.min(axis=0), graph.coords.max(axis=0)) if graph.n_edges else (np.zeros(2), np.zeros(2))
     return {
         "name": str(network.meta.get("name", "")),

@@ -25,6 +25,7 @@ from roadgeo import __version__
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError
+from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
@@ -40,7 +41,6 @@ __all__ = [
     "not_a_reference",
     "read_meta",
     "read_network",
-    "ring_area",
     "stored_digest",
     "write_network",
 ]
@@ -251,12 +251,6 @@ def computed_digest(path: str | os.PathLike[str]) -> str:
     return network_digest(RoadNetwork(empty, _read_intersections(path, plane), plane))
 
 
-def ring_area(ring: FloatArray) -> float:
-    """Area of a simple ring (V, 2), square units."""
-    x, y = (ring - ring.mean(axis=0)).T
-    return float(abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2)
-
-
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
@@ -269,7 +263,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             "coverage",
             "POLYGON",
             [plane.to_crs(ring) for ring in network.coverage],
-            {"area_km2": [ring_area(ring) / 1e6 for ring in network.coverage]},
+            {"area_km2": [polygon_area(ring) / 1e6 for ring in network.coverage]},
             plane.crs,
             draw_fill("120,144,156,18", "120,144,156", 0.4),
             "Where the map knows roads at all",

@@ -13,10 +13,9 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError, NotLocatedError, OutputError
-from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.frame import Frame, polygon_area
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import SCHEMA, Camera, Location, Place
 from roadgeo.outputs.orthophoto import ImageOptions

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.pinhole import make_view, polygon_area, sees_ground, warp_mask
+from roadgeo.geometry.pinhole import make_view, sees_ground, warp_mask
 
 CENTER = (1000.0, 2000.0)
 
@@ -94,3 +95,4 @@ def test_w_is_one_in_the_middle_and_the_lens_as_long_as_the_frame():
 def test_areas_of_polygons():
     triangle = np.array([[1.0, 1.0], [5.0, 1.0], [1.0, 4.0]])
     assert polygon_area(triangle) == polygon_area(triangle[::-1]) == 6.0
+    assert polygon_area(np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]) + 1e6) == 12

@@ -21,7 +21,6 @@ from roadgeo.reference.network_file import (
     network_digest,
     read_meta,
     read_network,
-    ring_area,
     stored_digest,
     write_network,
 )
@@ -267,10 +266,6 @@ def test_a_missing_folder_and_an_unknown_crs_leave_nothing(tmp_path: Path, netwo
     with pytest.raises(CrsError):
         write_network(tmp_path / "grid.gpkg", replace(network, plane=LocalPlane("EPSG:0", (0.0, 0.0))))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_ring_area() -> None:
-    assert ring_area(np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]) + 1e6) == 12
 
 
 class TestHostileTables:

@@ -17,8 +17,8 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo._text import counted
+from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
-from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.geometry.projection import transform
 from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.index import ReferenceIndex
