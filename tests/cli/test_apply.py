@@ -58,9 +58,8 @@ def test_a_crs_that_nobody_knows_is_refused(crs: str, said: str, located: Path, 
 
 
 def test_another_size_is_scaled_and_another_shape_only_where_asked(
-    located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    located: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     photo = cv2.imread(str(PHOTO))
     height, width = photo.shape[:2]
     cv2.imwrite("small.png", cv2.resize(photo, (width // 2, height // 2)))
@@ -76,9 +75,8 @@ def test_another_size_is_scaled_and_another_shape_only_where_asked(
 
 
 def test_what_is_no_location_is_refused_in_a_line(
-    located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    located: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     document = json.loads((located / "drone_location.json").read_text())
     changes = (
         {"homography": [[1, 2], [3, 4]]},

@@ -23,7 +23,6 @@ from roadgeo.reference.reference import open_reference
 @pytest.fixture
 def osm(tmp_path, monkeypatch):
     monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
     monkeypatch.setattr(time, "sleep", lambda _: None)
     with fake_osm() as state:
         yield state
@@ -83,8 +82,7 @@ def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
     ("given", "name"),
     [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
 )
-def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys, given, name):
-    monkeypatch.chdir(tmp_path)
+def test_a_reference_is_called_after_its_own_file(tmp_path, capsys, given, name):
     assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0
     (reference,) = tmp_path.glob("*.index")
     assert main(["info", str(reference)]) == 0
@@ -101,9 +99,8 @@ def counts(reference, capsys):
     return output["counts"]["intersections"], output["road_km"], output["meta"]
 
 
-def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch, capsys):
+def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, capsys):
     """After an edit, as in QGIS, every command says what to type, and that helps."""
-    monkeypatch.chdir(tmp_path)
     assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", "my map.gpkg", quiet=True) == 0
     n, *_ = counts("my map.gpkg", capsys)
     with closing(sqlite3.connect("my map.gpkg")) as database:
@@ -143,8 +140,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
     assert not list(out.iterdir())
 
 
-def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+def test_the_library_from_filling_to_removing(tmp_path, capsys):
     streets = write_streets(tmp_path / "Fenway Streets.geojson")
     for name in ("one", "two"):
         assert index("--roads", streets, "--name", name, quiet=True) == 0
@@ -156,17 +152,14 @@ def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
     assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]
 
 
-def test_a_reference_is_a_geopackage(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_reference_is_a_geopackage(tmp_path, capsys):
     write_streets(tmp_path / "a.geojson")
     assert main(["index", "--roads", "a.geojson", "--out", "maps/b.shp"]) == 2
     assert f"did you mean {Path('maps', 'b.gpkg')}?" in capsys.readouterr().err
     assert not (tmp_path / "maps").exists()
 
 
-def test_the_next_command_is_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+def test_the_next_command_is_named(tmp_path, capsys):
     write_streets(tmp_path / "a.geojson")
     assert main(["index", "--roads", "a.geojson", "--out", "maps/b.gpkg"]) == 0
     assert "search it with `roadgeo locate photo.jpg -r maps/b.gpkg`" in capsys.readouterr().out

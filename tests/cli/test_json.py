@@ -16,8 +16,7 @@ DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(autouse=True)
-def _desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def _library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
 
 

@@ -15,11 +15,6 @@ from roadgeo.geometry.homography import Homography
 DRONE = next(mask for mask in demo_masks() if mask.path.stem == "drone")
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def piece() -> gpd.GeoSeries:
     """Roads within 1200 x 1000 m of the map, in its metres."""

@@ -29,12 +29,6 @@ from roadgeo.reference.files import reference_digest
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
 
 
-@pytest.fixture(autouse=True)
-def _library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
-    monkeypatch.chdir(tmp_path)
-
-
 def center_error(found: dict, mask: DemoMask) -> float:
     middle = np.array(found["size"]) / 2
     x, y = pyproj.Transformer.from_crs(mask.crs, found["crs"], always_xy=True).transform(

@@ -17,11 +17,6 @@ from roadgeo.evaluation.demo import demo_masks
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
-@pytest.fixture(autouse=True)
-def _desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def locate(mask: str, porto: Path, *more: str) -> int:
     return main(["locate", mask, "-r", str(porto), "--effort", "quick", *more])
 

@@ -18,12 +18,6 @@ MASKS = {mask.path.stem: str(mask.path) for mask in demo_masks()}
 LOCATE = ["locate", MASKS["elsewhere"], "--effort", "quick"]
 
 
-@pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
-    monkeypatch.chdir(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def refused(porto: Path) -> roadgeo.Location:
     """The demonstration's mask of another city."""

@@ -21,11 +21,6 @@ from roadgeo.outputs.verification_files import write_fixed
 SHEET = next(mask for mask in demo_masks() if mask.path.stem == "map_sheet")
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def georeferenced(name: str, east: float, north: float) -> Path:
     """The map sheet on its own pixels, its place moved."""
     values = cv2.imread(str(SHEET.path), cv2.IMREAD_GRAYSCALE)

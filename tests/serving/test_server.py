@@ -266,10 +266,7 @@ def test_a_disk_that_is_full_is_no_fault(monkeypatch):
 def test_a_disk_that_is_full_keeps_nobody_out_for_ever(monkeypatch):
     with serving() as server:
         fill(monkeypatch, 2)
-        jobs = []
-        for _ in range(2):
-            jobs.append(ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"])
-            wait_for(server, jobs[-1], "successful")
+        jobs = [finished(server) for _ in range(2)]
         assert [ask(server, "POST", "/locate", PNG)[0].status for _ in range(2)] == [503, 200]
         assert [ask(server, "GET", f"/jobs/{job}")[0].status for job in jobs] == [404, 200]
 
@@ -277,11 +274,9 @@ def test_a_disk_that_is_full_keeps_nobody_out_for_ever(monkeypatch):
 def test_an_answer_without_its_view_is_kept_and_makes_room():
     workers = Workers()
     with serving(workers) as server:
-        old = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
-        wait_for(server, old, "successful")
+        old = finished(server)
         workers.ask = lambda *_: Answer(200, FOUND, lacks_view=True)
-        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
-        wait_for(server, job, "successful")
+        job = finished(server)
         assert ask(server, "GET", f"/jobs/{job}/results")[1] == {"location": FOUND}
         assert ask(server, "GET", f"/jobs/{old}")[0].status == 404
 
@@ -487,6 +482,13 @@ def wait_for(server, job, *states):
     raise AssertionError(document)
 
 
+def finished(server, body=PNG, headers=LATER):
+    """Send an image, and return its job once that is done."""
+    job = ask(server, "POST", "/locate", body, headers)[1]["jobID"]
+    wait_for(server, job, "successful")
+    return job
+
+
 def test_who_prefers_not_to_wait_gets_a_job():
     workers = Workers()
     workers.busy.clear()
@@ -554,10 +556,7 @@ def test_a_job_is_called_off_and_forgotten():
 
 def test_the_latest_answers_are_kept():
     with serving(kept_jobs=2) as server:
-        jobs = []
-        for _ in range(4):
-            jobs.append(ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"])
-            wait_for(server, jobs[-1], "successful")
+        jobs = [finished(server) for _ in range(4)]
         there = [ask(server, "GET", f"/jobs/{job}")[0].status for job in jobs]
         assert there == [404, 404, 200, 200]
         assert len(list(server._workers.folder.iterdir())) == 2
@@ -634,8 +633,7 @@ def test_an_image_is_searched_again_with_other_hints():
     workers = Workers()
     with serving(workers) as server:
         body, headers = form((b'name="image"; filename="a.png"', PNG))
-        first = ask(server, "POST", "/locate", body, {**headers, **LATER})[1]["jobID"]
-        wait_for(server, first, "successful")
+        first = finished(server, body, {**headers, **LATER})
         answer, job = ask(server, "POST", f"/jobs/{first}/again?near=1,2,300", b"")
         assert answer.status == 201
         assert urljoin(f"/at/jobs/{first}/again", answer.headers["Location"]) == f"/at/jobs/{job['jobID']}"
@@ -660,8 +658,7 @@ def test_an_image_stays_as_it_was_sent_whatever_it_is_called(name, town, monkeyp
     image = cv2.imencode(Path(name).suffix, np.full((40, 60, 3), 99, np.uint8))[1].tobytes()
     body, headers = form((b'name="image"; filename="%b"' % name.encode(), image))
     with serving(workers) as server:
-        first = ask(server, "POST", "/locate", body, {**headers, **LATER})[1]["jobID"]
-        wait_for(server, first, "successful")
+        first = finished(server, body, {**headers, **LATER})
         again = ask(server, "POST", f"/jobs/{first}/again", b"")[1]["jobID"]
         wait_for(server, again, "successful")
         assert [Path(asked.path).read_bytes() == image for asked in workers.asked] == [True, True]
@@ -671,8 +668,7 @@ def test_an_image_stays_as_it_was_sent_whatever_it_is_called(name, town, monkeyp
 def test_the_host_chooses_no_file():
     workers = Workers()
     with serving(workers) as server:
-        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
-        wait_for(server, job, "successful")
+        job = finished(server)
         own = Path(workers.asked[0].path).parent.with_name("own")
         own.mkdir()
         (own / "kept.pickle.gz").write_bytes(b"ours")
@@ -683,8 +679,7 @@ def test_the_host_chooses_no_file():
 def test_only_files_that_are_offered_may_be_had():
     workers = Workers()
     with serving(workers) as server:
-        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
-        wait_for(server, job, "successful")
+        job = finished(server)
         offered = [item["name"] for item in ask(server, "GET", f"/jobs/{job}/files")[1]["files"]]
         assert {"json", "footprint", "report"} <= set(offered)
         assert "vrt" not in offered
