@@ -20,7 +20,7 @@ from roadgeo.geometry.projection import to_plane
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import open_reference
 from roadgeo.running.processes import run
-from roadgeo.storage.files import write_text
+from roadgeo.storage.files import write_text, writing
 from roadgeo.workflows import LocateOptions, locate
 
 __all__ = [
@@ -271,8 +271,5 @@ def _read_record(path: Path, settings: dict[str, Any]) -> list[Trial]:
 
 def _append(path: Path, trial: Trial) -> None:
     line = json.dumps({"truth": truth_to_record(trial.truth), "answer": trial.answer})
-    try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another folder") from error
+    with writing(path), path.open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
