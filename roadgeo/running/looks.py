@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -140,18 +140,10 @@ def _less_sure(place: Place, off: float) -> Place:
 
 def _refused(location: Location, reason: str) -> Location:
     """Return a location of which nothing is left but what was seen."""
-    bare = Location(
-        location.query,
-        "not_located",
-        reason,
-        location.reference,
-        location.attribution,
-        reason_code=Reason.TOO_MANY_LOOKS,
-        alternatives=location.places,
-    )
-    kept = ("size", "n_intersections", "seconds", "stats", "stopped", "seen")
-    seen = {name: getattr(location, name) for name in kept}
-    return replace(bare, **seen)
+    names = ("query", "reference", "attribution", "size", "n_intersections", "seconds", "stats", "stopped", "seen")
+    kept: dict[str, Any] = {name: getattr(location, name) for name in names}
+    code = Reason.TOO_MANY_LOOKS
+    return Location(status="not_located", reason=reason, reason_code=code, alternatives=location.places, **kept)
 
 
 def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
