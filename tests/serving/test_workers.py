@@ -226,7 +226,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
     def none(*_, **__):
         raise ModelError("photographs need onnxruntime: pip install 'roadgeo[segment]'")
 
-    monkeypatch.setattr("roadgeo.serving.workers._size", lambda _: (10, 10))
+    monkeypatch.setattr("roadgeo.storage.rasters.raster_size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
     answer = _answer(Asked("/images/sent/photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415

@@ -3,10 +3,9 @@
 import asyncio
 import io
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Semaphore
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -19,7 +18,7 @@ from uvicorn.server import ServerState
 
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
-from roadgeo.serving.workers import Answer, Place
+from roadgeo.serving.workers import Answer
 
 
 @contextmanager
@@ -60,7 +59,7 @@ class _Wire(asyncio.Transport):
 
 
 _LIMITS = ServeOptions(body_s=0.2)
-_WORKERS = SimpleNamespace(take_place=lambda: Place(Semaphore()), ask=lambda *_: Answer(200, {}))
+_WORKERS = SimpleNamespace(take_place=ExitStack, ask=lambda *_: Answer(200, {}))
 
 
 def serve_request(content: bytes) -> bytes:
