@@ -300,13 +300,20 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
         stopped = f"stopped at the time limit of {limit:g} s{tracing}, {_CUT_SHORT}"
         told = f"{stopped}; of the places tried, {best}{searched}; {_how_far(query, found, options)}"
         return Reason.TIME_LIMIT, told
-    nothing = f"no place on this map stands out: {best}{searched}"
-    advice = "; more roads in view or another map may help"
-    if searched:
-        advice = ": more roads in view or a wider search may help"
-    elif options.effort == "quick":
-        advice = "; a search with full effort, more roads in view or another map may help"
-    return Reason.NOTHING_STANDS_OUT, f"{nothing}{advice}"
+    return Reason.NOTHING_STANDS_OUT, f"no place on this map stands out: {best}{searched}; {_what_may_help(options)}"
+
+
+def _what_may_help(options: LocateOptions) -> str:
+    """List what may decide: the hints that are not given, for they exclude rivals, and more to see."""
+    camera, usual = options.match.camera, CameraOptions()
+    missing = {
+        "the size of a pixel (--gsd)": camera.gsd_m == usual.gsd_m,
+        "the heading (--heading)": camera.heading_deg is None and not camera.north_up,
+        "the place (--near)": options.near is None and options.match.within is None,
+        "a search with full effort": options.effort == "quick",
+    }
+    *helps, last = [*(name for name, lacks in missing.items() if lacks), "more roads in view", "another map"]
+    return f"{', '.join(helps)} or {last} may help"
 
 
 def _lead(score: float, needed: float) -> str:

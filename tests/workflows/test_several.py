@@ -191,13 +191,25 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
 @pytest.mark.parametrize(
     ("near", "camera", "reported"),
     [
-        (None, {}, "; more roads in view or another map may help"),
-        (NEAR, {}, "; searched within 500 m of -71.06,42.36: more roads in view or a wider search may help"),
-        ((8.123456, -1.0, 1234567.0), {}, "; searched within 1200 km of 8.12346,-1: "),
-        (None, {"gsd_m": (0.5, 1.0)}, "; searched at 0.5 to 1 m per pixel: "),
-        (None, {"max_tilt_deg": 20.0}, "; searched tilted by up to 20 degrees: "),
-        (None, {"focal_px": 1280.0}, "; searched with a focal length of 1280 pixels: "),
-        (NEAR, {"gsd_m": (0.5, 1.0), "north_up": True}, "of -71.06,42.36, at 0.5 to 1 m per pixel, north up: "),
+        (None, {}, "; the size of a pixel (--gsd), the heading (--heading), the place (--near), more roads in view or"),
+        (
+            NEAR,
+            {},
+            "; searched within 500 m of -71.06,42.36; the size of a pixel (--gsd), the heading (--heading), more",
+        ),
+        ((8.123456, -1.0, 1234567.0), {}, "; searched within 1200 km of 8.12346,-1; "),
+        (
+            None,
+            {"gsd_m": (0.5, 1.0)},
+            "; searched at 0.5 to 1 m per pixel; the heading (--heading), the place (--near)",
+        ),
+        (None, {"max_tilt_deg": 20.0}, "; searched tilted by up to 20 degrees; "),
+        (None, {"focal_px": 1280.0}, "; searched with a focal length of 1280 pixels; "),
+        (
+            NEAR,
+            {"gsd_m": (0.5, 1.0), "north_up": True},
+            "; searched within 500 m of -71.06,42.36, at 0.5 to 1 m per pixel, north up; more",
+        ),
     ],
 )
 @pytest.mark.parametrize("stopped", ["exhausted", "time"])
@@ -206,7 +218,7 @@ def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camer
     reason = judge(query, searched("a", stopped=stopped), near=near, match=match).reason
     if stopped == "time":
         assert reason.startswith("stopped at the time limit of 60 s")
-        assert (reported.partition(": ")[0] if near or camera else "none fits") in reason
+        assert ("; ".join(reported.split("; ")[:2]) if near or camera else "none fits") in reason
     else:
         assert reported in reason
         assert reason.endswith(" may help")
