@@ -18,7 +18,7 @@ from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.realdata
 
-FEW = ("boston_2", "miami_25")
+FEW = ("boston_2", "miami_26")
 
 
 @pytest.fixture(scope="module")
