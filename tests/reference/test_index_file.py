@@ -159,16 +159,25 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
     assert "no such file" in check_index(tmp_path / "none.index")[0]
 
 
-def test_too_little_memory_is_no_fault_of_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("number", "told", "is_the_file"),
+    [
+        (errno.ENOMEM, "too little memory to open it; end other programs", False),
+        (errno.EIO, "input/output error", True),
+    ],
+)
+def test_too_little_memory_is_no_fault_of_the_file(
+    path: Path, monkeypatch: pytest.MonkeyPatch, number: int, told: str, is_the_file: bool
+) -> None:
     """It said: build it again."""
 
     def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(index_file.mmap, "mmap", refuse)
-    with pytest.raises(RoadgeoError, match="too little memory to open it; end other programs") as raised:
+    with pytest.raises(RoadgeoError, match=told) as raised:
         read_index(path)
-    assert not isinstance(raised.value, IndexFormatError)
+    assert isinstance(raised.value, IndexFormatError) == is_the_file
 
 
 def test_other_versions_are_named(path: Path) -> None:
@@ -203,12 +212,12 @@ def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     raw = path.read_bytes()
     rng = np.random.default_rng(1)
     n_refused = 0
-    for position in [*range(600), *rng.integers(0, len(raw), 400).tolist()]:
+    for position in [*range(0, 1600, 3), *rng.integers(0, len(raw), 400).tolist()]:  # to the pickle; all
         mutated = bytearray(raw)
         mutated[position] ^= 1 << int(rng.integers(8))
         path.write_bytes(mutated)
         n_refused += refused_or_equal(path)
-    assert n_refused > 900  # harmless are only paddings
+    assert n_refused > 850  # harmless are only paddings
 
 
 @pytest.mark.slow
