@@ -25,7 +25,6 @@ import struct
 import subprocess  # nosec B404
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -242,6 +241,12 @@ _MATCHING = (
 )
 #: What a map needs: the first thing that a newcomer makes.
 _MAPS = ("simplification", "parallel_roads", "intersections", "buckets", "triple_codes", "roads")
+#: What processes of their own compile, each in this order.
+_GROUPS = (
+    _MAPS,
+    ("thinning", "tracing", "triples", "point_matching"),
+    ("growth", "adjustment", "road_raster", "road_rings", "road_votes", "road_growth"),
+)
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []
 
@@ -344,44 +349,43 @@ def _without_collection() -> Iterator[None]:
 
 
 def _compile_together(modules: Sequence[str], progress: Progress) -> None:
-    """Compile modules in as many processes as there are processors.
+    """Compile several modules, each group of them by a process of its own; the rest, and what fails there, by this one.
 
-    This process begins with the first module, the others with the last: neighbours have parts in common, and each
-    process compiles a part once.
+    The machine code of a module depends on what its process compiled before. So the groups are the same on every
+    machine, and fit for two processors.
     """
     kernels = {module: len(entries(module)) for module in modules}
-    waiting, done = deque(modules), dict.fromkeys(modules, 0)
+    done = dict.fromkeys(modules, 0)
 
     def report(module: str, n: int) -> None:
         done[module] = n
         progress(sum(done.values()), sum(kernels.values()))
 
-    def take(pop: Callable[[], str]) -> Iterator[str]:
-        with contextlib.suppress(IndexError):
-            while True:
-                yield pop()
-
-    def share(helper: subprocess.Popen[str]) -> None:
-        with contextlib.suppress(OSError), helper:  # one that dies leaves its module to this process
-            for module in take(waiting.pop):
+    def share(group: Sequence[str]) -> None:
+        with contextlib.suppress(OSError), _start_helper() as helper:
+            for module in group:
                 if _ask(helper, module):
                     done[module] = kernels[module]
 
-    threads = [threading.Thread(target=share, args=(helper,), daemon=True) for helper in _helpers(len(modules) - 1)]
+    wanted = [[m for m in map("roadgeo.kernels.{}".format, group) if m in kernels] for group in _GROUPS]
+    # Within another program, as QGIS, that is what `sys.executable` may name.
+    may_start = len(modules) > 1 and Path(sys.executable or "").stem.lower().startswith("python")
+    threads = [threading.Thread(target=share, args=(group,), daemon=True) for group in wanted if group and may_start]
     for thread in threads:
         thread.start()
-    for module in take(waiting.popleft):
-        _compile(module, functools.partial(report, module))
     for thread in threads:
         while thread.is_alive():
-            thread.join(0.2)
             progress(sum(done.values()), sum(kernels.values()))
+            thread.join(0.2)
     for module in modules:
-        if module not in _left_to_numba and not _load(module):
+        if not _load(module):
             _compile(module, functools.partial(report, module))
+    if threads:
+        progress(sum(kernels.values()), sum(kernels.values()))
 
 
-#: Starts a process that compiles the modules whose names it reads, line by line, and answers when each is done.
+#: Starts a process that compiles the modules whose names it reads, line by line, and answers when each is done. It
+#: ends when nobody asks it any more.
 _HELP = """
 import sys
 sys.path[:] = sys.argv[1:]
@@ -390,23 +394,16 @@ for line in sys.stdin:
     load([line.strip()])
     print("done", flush=True)
 """
-#: More would wait for the longest module.
-_MOST_HELPERS = 6
 
 
-def _helpers(most: int) -> Iterator[subprocess.Popen[str]]:
-    """Start a process that compiles for each other processor. It ends when nobody asks it any more."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
-    # Within another program, as QGIS, that is what `sys.executable` may name.
-    if not Path(sys.executable or "").stem.lower().startswith("python"):
-        return
-    command = [sys.executable, "-I", "-c", _HELP, *sys.path]
-    for _ in range(min(most, processors - 1, _MOST_HELPERS)):
-        with contextlib.suppress(OSError):
-            yield subprocess.Popen(  # noqa: S603 # nosec B603
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            )
+def _start_helper() -> subprocess.Popen[str]:
+    return subprocess.Popen(  # noqa: S603 # nosec B603
+        [sys.executable, "-I", "-c", _HELP, *sys.path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
 
 
 def _ask(helper: subprocess.Popen[str], module: str) -> bool:
