@@ -187,7 +187,7 @@ class Rivals:
             others += _around(picture, best.matrix, reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.worth, default=None)
             lead = worth - max(0.0 if rival is None else rival.worth, 0.0)
-        lead -= self._by_chance
+        lead -= self._by_chance + self.doubt(estimator, best)
         if rival is None:
             return Standing(best, None, lead, worth)
         return Standing(best, rival.matrix, lead, worth, rival.worth)
