@@ -197,7 +197,7 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
     assert main(["locate", mask, *reference, "--near=-8.60,41.15,500"]) == 3
     assert capfd.readouterr().out == ""
     for limits, reported in [
-        (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15: "),
+        (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15; "),
         (["--within", "Italy"], "the map has 0 intersections in the area given by within; searched within longitudes"),
         (
             ["--near=2.35,48.85,2000", "--gsd", "0.8:1.2"],
