@@ -69,7 +69,7 @@ N_LAID = 8
 _APART, _SAME = 0.04, 0.67
 #: Where traced roads and a soft picture favour the same place, this part of the lesser lead counts as well, for they
 #: are not independent, and in a drawn mask they are the same; where they favour different places, it counts against.
-#: Traced roads that speak against the picture's place count in full.
+#: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
 #: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
 #: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
@@ -147,14 +147,10 @@ class Rivals:
         seen = self._by_picture(estimator)
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
-        lesser = other.log10_lead
-        if not estimator.same(best.model, other.model):
-            change = -max(lesser, 0.0)
-        elif lesser > 0.0:
-            change = _AGREEING * is_soft * lesser
-        else:
-            change = lesser if best is seen else 0.0
-        best = best._replace(log10_lead=best.log10_lead + change)
+        is_same, lesser = estimator.same(best.model, other.model), max(other.log10_lead, 0.0)
+        if is_same and best is seen and by_roads.log10_lead < 0.0:
+            return by_roads
+        best = best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
         if best.rival is None or best.model is by_roads.model or is_soft:
             return best
         scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
