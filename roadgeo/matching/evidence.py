@@ -31,6 +31,7 @@ from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.shifts import shifted
 
 __all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
@@ -252,7 +253,7 @@ class Evidence:
             matrix, points, directions, weights, reach_m, MIN_COS, shifts, self.index.road_buckets, shares
         )
         best = np.argsort(-shares, kind="stable")[:_WEIGHED]
-        return max((self.weigh(_shifted(matrix, shifts[k])) for k in best), default=0.0)
+        return max((self.weigh(shifted(matrix, *shifts[k])) for k in best), default=0.0)
 
     def _least_shift(self, reach_m: float) -> float:
         """Return the factor on `_SHIFT_M`: the shortest shift is three times the distance at which roads agree."""
@@ -313,13 +314,6 @@ def agreement(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[
     """Return the agreement at a place, and its matched intersections and their distances (`match_intersections`)."""
     matched, distance = match_intersections(matrix, scene, index)
     return Evidence(scene, index, sampling(matrix, scene.size)).agreement(matrix, matched), matched, distance
-
-
-def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:
-    """Return a place (3, 3) moved by a shift (2,) in metres."""
-    moved = matrix.copy()
-    moved[:2] += np.outer(shift, matrix[2])
-    return moved
 
 
 def _anyhow(expected: float) -> int:

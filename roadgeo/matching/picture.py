@@ -28,8 +28,9 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
+from roadgeo.matching.shifts import Shift, move_about, shifted
 
-__all__ = ["Peak", "Picture", "shifted"]
+__all__ = ["Peak", "Picture"]
 
 #: Grid of the marginalised shares: of the map's roads that are missing, and the density of false roads.
 _MISSING = np.array([0.05, 0.15, 0.3, 0.5, 0.75])
@@ -154,7 +155,7 @@ class Picture:
         found: list[Peak] = []
         reach, apart = int(reach_m / cell_m), max(int(apart_m / cell_m), 1)
         for turn_deg in turns_deg:
-            turned = rotate_about(center, turn_deg) @ matrix
+            turned = move_about(center, Shift(0.0, 0.0, turn_deg, 1.0, 0.0)) @ matrix
             rectified = self._rectify(turned, ground)
             if rectified is None:
                 continue
@@ -251,16 +252,3 @@ def draw_roads(index: ReferenceIndex, low: FloatArray, high: FloatArray, cell_m:
     ends = np.round(lines / cell_m * 16.0 - 8.0).astype(np.int32)
     cv2.polylines(canvas, list(ends), False, 255, max(1, round(_ROAD_M / cell_m)), cv2.LINE_AA, 4)
     return Ground(canvas.astype(np.float32) / 255.0, low, cell_m)
-
-
-def rotate_about(center: FloatArray, turn_deg: float) -> FloatArray:
-    """Return the (3, 3) motion that turns the plane clockwise about a point (2,)."""
-    turn = -math.radians(turn_deg)
-    linear = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    to = center - linear @ center
-    return np.array([[*linear[0], to[0]], [*linear[1], to[1]], [0.0, 0.0, 1.0]])
-
-
-def shifted(matrix: FloatArray, east_m: float, north_m: float) -> FloatArray:
-    """Return a place (3, 3) moved on the map."""
-    return np.array([[1.0, 0.0, east_m], [0.0, 1.0, north_m], [0.0, 0.0, 1.0]]) @ matrix

@@ -150,11 +150,12 @@ class Rivals:
         is_same, lesser = estimator.same(best.model, other.model), max(other.log10_lead, 0.0)
         if is_same and best is seen and by_roads.log10_lead < 0.0:
             return by_roads
-        best = best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
-        if best.rival is None or best.model is by_roads.model or is_soft:
-            return best
-        scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
-        return best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
+        if (
+            best is seen and best.rival is not None and not is_soft
+        ):  # likelihoods of drawn masks are those of their roads
+            scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
+            best = best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
+        return best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
 
     @property
     def _by_chance(self) -> float:

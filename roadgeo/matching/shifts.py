@@ -26,6 +26,7 @@ __all__ = [
     "Shift",
     "move_about",
     "search_nearby",
+    "shifted",
 ]
 
 
@@ -89,6 +90,11 @@ def move_about(center: FloatArray, shift: Shift) -> FloatArray:
     linear = np.array([[a, -b], [b, a]])
     to = center - linear @ center + np.array([shift.east_m, shift.north_m])
     return np.array([[a, -b, to[0]], [b, a, to[1]], [0.0, 0.0, 1.0]])
+
+
+def shifted(matrix: FloatArray, east_m: float, north_m: float) -> FloatArray:
+    """Return a place (3, 3) moved on the map."""
+    return np.array([[1.0, 0.0, east_m], [0.0, 1.0, north_m], [0.0, 0.0, 1.0]]) @ matrix
 
 
 def search_nearby(

@@ -10,7 +10,8 @@ from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import picture as pictures
-from roadgeo.matching.picture import Picture, shifted
+from roadgeo.matching.picture import Picture
+from roadgeo.matching.shifts import Shift, move_about, shifted
 
 SIZE = (900, 700)
 TRUTH = camera((2000.0, 1900.0), SIZE, 1.0, heading_deg=15.0)
@@ -75,7 +76,7 @@ def test_it_favours_the_place_its_scale_and_its_heading(town, scene, strength):
         about = shifted(scaled @ shifted(np.eye(3), *-middle), *middle) @ TRUTH
         assert picture.weigh(about) < 0.3 * there
     for turn_deg in (10.0, 90.0, 180.0):
-        assert picture.weigh(pictures.rotate_about(middle, turn_deg) @ TRUTH) < 0.3 * there
+        assert picture.weigh(move_about(middle, Shift(0.0, 0.0, turn_deg, 1.0, 0.0)) @ TRUTH) < 0.3 * there
 
 
 def test_places_that_have_nothing_to_do_with_it_are_seldom_likely(town, scene):
@@ -105,7 +106,7 @@ def test_ground_that_was_not_observed_and_a_map_without_roads_say_nothing(town, 
 def test_correlation_finds_the_place_among_all_shifts_and_turns(town, scene):
     picture = Picture(soft(scene), town[1], 1.0)
     middle = Homography(TRUTH).everywhere(scene.center)
-    start = pictures.rotate_about(middle, 90.0) @ shifted(TRUTH, 250.0, -120.0)
+    start = move_about(middle, Shift(0.0, 0.0, 90.0, 1.0, 0.0)) @ shifted(TRUTH, 250.0, -120.0)
     peaks = picture.correlate(start, 600.0, (0.0, 90.0, 180.0, 270.0), 5, 30.0)
     assert [peak.worth for peak in peaks] == sorted((peak.worth for peak in peaks), reverse=True)
     best = picture.settle(peaks[0])
