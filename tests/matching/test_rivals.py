@@ -1,5 +1,7 @@
 """The best other place, on a lattice: a block beside explains nearly as much, and what is missing there decides."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
+from roadgeo.matching.rivals import Rivals, Standing, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.matching.triples import larger
@@ -268,3 +270,29 @@ def test_streets_around_are_looked_at_only_where_the_places_met_and_the_blocks_b
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
     assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), (rivals._AROUND,)]
+
+
+# --- traced roads and the picture -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("by_roads", "by_picture", "is_same", "lead"),
+    [
+        (2.0, 5.0, True, 6.0),  # half of the lesser lead counts as well
+        (5.0, 2.0, True, 6.0),
+        (2.0, 5.0, False, 3.0),  # or against
+        (-1.0, 5.0, False, 5.0),
+        (-1.0, 5.0, True, -1.0),  # a grid turned over: traced roads speak against the picture's place
+        (13.0, None, True, 13.0),  # beyond doubt: the picture is not asked
+    ],
+)
+def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_roads, by_picture, is_same, lead):
+    truth, index, evidence = plain
+    soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
+    elsewhere = move_about(Homography(truth)(soft.center), Shift(700.0, 300.0, 0.0, 1.0, 0.0)) @ truth
+    estimator = TripleEstimator(soft, index)
+    item = Search(estimator)
+    here, there = (Hypothesis.at(matrix, soft, index) for matrix in (truth, truth if is_same else elsewhere))
+    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: Standing(here, None, by_roads))
+    monkeypatch.setattr(Rivals, "_by_picture", lambda *_: Standing(there, None, by_picture))
+    assert Rivals({item: estimator}, Ledger(), NEEDED).standing(item).log10_lead == pytest.approx(lead)
