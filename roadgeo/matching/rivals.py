@@ -59,6 +59,9 @@ _WORTH_LOOKING = 0.5
 #: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
 #: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
 _DOUBT = 60.0
+#: A place has no lead by the picture if it loses this score: in a grid that equals its mirror image the lead grows with
+#: the frame, and so must the part that is taken off.
+_DISBELIEVED = 6.0
 #: Number of the likeliest places met by the search that are compared; and number of road points for the rough
 #: refinement of places around.
 _N_KNOWN, _N_POINTS = 12, 200
@@ -73,7 +76,7 @@ _APART, _SAME = 0.04, 0.67
 _AGREEING = 0.5
 #: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
 #: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
-_REACHES_M, _CLEAR, _PEAKS, _WEIGHED = (1000.0, 4000.0), 12.0, 12, 4
+_REACHES_M, _PEAKS, _WEIGHED = (1000.0, 4000.0), 12, 4
 #: The picture's places are different if their middles are further apart than this, metres and pixels.
 _BESIDE_M, _BESIDE_PX = 30.0, 8.0
 #: Streets around a place, and the blocks beside it.
@@ -148,14 +151,17 @@ class Rivals:
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
         is_same, lesser = estimator.same(best.model, other.model), max(other.log10_lead, 0.0)
-        if is_same and best is seen and by_roads.log10_lead < 0.0:
-            return by_roads
         if (
             best is seen and best.rival is not None and not is_soft
         ):  # likelihoods of drawn masks are those of their roads
             scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
             best = best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
         return best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
+
+    @property
+    def _worth_looking(self) -> float:
+        """Least lead of a place that is compared with places farther away."""
+        return _WORTH_LOOKING * self.needed
 
     @property
     def _by_chance(self) -> float:
@@ -186,12 +192,12 @@ class Rivals:
         ]
         worth, lead, rival = picture.weigh(best.matrix), math.inf, None
         for reach_m in _REACHES_M:
-            if reach_m > _REACHES_M[0] and not _WORTH_LOOKING * self.needed <= lead < _CLEAR:
-                break
             others += _around(picture, best.matrix, reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.worth, default=None)
             lead = worth - max(0.0 if rival is None else rival.worth, 0.0)
-        lead -= self._by_chance + self.doubt(estimator, best)
+            if not self._worth_looking <= lead < _CERTAIN:
+                break
+        lead = lead * max(1.0 - self.doubt(estimator, best) / _DISBELIEVED, 0.0) - self._by_chance
         if rival is None:
             return Standing(best, None, lead, worth)
         return Standing(best, rival.matrix, lead, worth, rival.worth)
@@ -262,12 +268,14 @@ class Rivals:
         met = (Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known)
         rivals = list(filter(is_rival, met))
         standing = stand(rivals)
-        leads = standing.log10_lead >= _WORTH_LOOKING * self.needed
-        if not leads and estimator.nearby(best) < _REPEATING * worth:
+        if standing.log10_lead < self._worth_looking and estimator.nearby(best) < _REPEATING * worth:
             return standing
-        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
+        for around in _NEARBY, _AROUND:  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(matrix, evidence, compare, estimator.options, around))
-        return stand(rivals)
+            standing = stand(rivals)
+            if not self._worth_looking <= standing.log10_lead < _CERTAIN:
+                break
+        return standing
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return the score against a place for the roads that it contradicts; computed once for each matrix."""

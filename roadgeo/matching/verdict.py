@@ -74,14 +74,15 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     # The best place of all references, and the others.
     candidates = _pool(query, found)
     best, rivals = (candidates[0] if candidates else None), candidates[1:]
-    places = _list_places(location, query, found, candidates, options)
+    listed = _listed(query, found, candidates)
+    places = tuple(_describe(location, query, listed, number, options) for number in range(1, 1 + len(listed)))
     if best is not None:
         runner_up = places[1] if rivals else None
         location = replace(location, log10_odds=best.score, runner_up=runner_up, alternatives=places[1:])
     needed = options.min_log10_odds
     rival = None if best is None else _equal(best, rivals, needed)
     if best is None or (best.score < needed and rival is None):
-        return _refuse(replace(location, alternatives=places), query, found, best, options)
+        return _refuse(replace(location, alternatives=places), query, found, listed, options)
     best = _against(best, rivals)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
@@ -157,29 +158,25 @@ def _distinct(query: Query, pool: Sequence[_Candidate], known: Sequence[_Candida
     return distinct[len(known) :]
 
 
-def _list_places(
-    location: Location,
-    query: Query,
-    found: Sequence[Found],
-    candidates: Sequence[_Candidate],
-    options: LocateOptions,
-) -> tuple[Place, ...]:
-    """List the best places with their footprints: the candidates, then others that were verified.
-
-    All that may be taken are described whole.
-    """
+def _listed(query: Query, found: Sequence[Found], candidates: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return the places that an answer lists: the candidates, then others that were verified."""
     if not candidates:
-        return ()
+        return []
     further = _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.further], candidates)
-    places = []
-    for number, one in enumerate([*candidates, *further][:N_PLACES], 1):
-        corners = Homography(one.fit.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
-        plane, frame = one.fit.index.plane, None
-        ring = tuple((lon, lat) for lon, lat in to_lonlat(plane.crs, plane.to_crs(corners)).tolist())
-        if options.take is not None and number <= options.take:
-            frame = place_frame(_on(location, one.found), query, one.fit, options.match)
-        places.append(replace(_seen_from(candidates[0], one), footprint_lonlat=ring, frame=frame))
-    return tuple(places)
+    return [*candidates, *further][:N_PLACES]
+
+
+def _describe(
+    location: Location, query: Query, listed: Sequence[_Candidate], number: int, options: LocateOptions
+) -> Place:
+    """Describe the listed place of this number, from 1, with its footprint; whole, if it may be taken."""
+    one = listed[number - 1]
+    corners = Homography(one.fit.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
+    plane, frame = one.fit.index.plane, None
+    ring = tuple((lon, lat) for lon, lat in to_lonlat(plane.crs, plane.to_crs(corners)).tolist())
+    if options.take is not None and number <= options.take:
+        frame = place_frame(_on(location, one.found), query, one.fit, options.match)
+    return replace(_seen_from(listed[0], one), footprint_lonlat=ring, frame=frame)
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
@@ -251,7 +248,7 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
     """Report the place that the paper's method found; the method has no scores."""
     best = next((one for one in found if one.fits), None)
     if best is None:
-        return _refuse(location, query, found, None, options)
+        return _refuse(location, query, found, [], options)
     placed = place_frame(_on(location, best), query, best.fits[0], options.match)
     return replace(placed, status="located", reason=best.said, reason_code=Reason.LOCATED)
 
@@ -260,12 +257,11 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
 
 
 def _refuse(
-    location: Location, query: Query, found: Sequence[Found], best: _Candidate | None, options: LocateOptions
+    location: Location, query: Query, found: Sequence[Found], listed: Sequence[_Candidate], options: LocateOptions
 ) -> Location:
     """Describe why nothing is reported, for the reference that came nearest."""
-    nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
-    score = best.score if best is not None else -math.inf
-    code, reason = _why_nothing(query, nearest, score, options)
+    nearest = listed[0].found if listed else max(found, key=lambda one: one.n_tried)
+    code, reason = _why_nothing(query, nearest, listed, options)
     location = replace(location, reason_code=code)
     distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
     if len(distinct) == 1:
@@ -280,7 +276,9 @@ def _refuse(
     )
 
 
-def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> tuple[Reason, str]:
+def _why_nothing(
+    query: Query, found: Found, listed: Sequence[_Candidate], options: LocateOptions
+) -> tuple[Reason, str]:
     """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
         return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
@@ -290,6 +288,7 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     if found.n_searched == 0 and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
         return Reason.FEW_NEAR, f"the map has {counted(found.n_searched, 'intersection')} {given}{searched}"
+    score = listed[0].score if listed else -math.inf
     best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if found.stopped == "work":
         told = f"stopped after as much work as a search may take; of the places tried, {best}{searched}"
@@ -300,20 +299,33 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
         stopped = f"stopped at the time limit of {limit:g} s{tracing}, {_CUT_SHORT}"
         told = f"{stopped}; of the places tried, {best}{searched}; {_how_far(query, found, options)}"
         return Reason.TIME_LIMIT, told
-    return Reason.NOTHING_STANDS_OUT, f"no place on this map stands out: {best}{searched}; {_what_may_help(options)}"
+    return (
+        Reason.NOTHING_STANDS_OUT,
+        f"no place on this map stands out: {best}{searched}; {_what_may_help(query, listed, options)}",
+    )
 
 
-def _what_may_help(options: LocateOptions) -> str:
-    """List what may decide: the hints that are not given, for they exclude rivals, and more to see."""
+def _what_may_help(query: Query, listed: Sequence[_Candidate], options: LocateOptions) -> str:
+    """List what may decide: more to see, and the missing hints, with the number of listed places that each leaves."""
     camera, usual = options.match.camera, CameraOptions()
-    missing = {
-        "the size of a pixel (--gsd)": camera.gsd_m == usual.gsd_m,
-        "the heading (--heading)": camera.heading_deg is None and not camera.north_up,
-        "the place (--near)": options.near is None and options.match.within is None,
-        "a search with full effort": options.effort == "quick",
-    }
-    *helps, last = [*(name for name, lacks in missing.items() if lacks), "more roads in view", "another map"]
-    return f"{', '.join(helps)} or {last} may help"
+    views = [pose(one.fit.matrix, query.scene.size) for one in listed]
+    spots = [np.array([one.center.lon, one.center.lat]) for one in listed]
+    turned = [abs((view.rotation_deg - views[0].rotation_deg + 180.0) % 360.0 - 180.0) for view in views]
+    scaled = [abs(math.log(view.gsd_m / views[0].gsd_m)) for view in views]
+    away = [metres_apart(spots[0], spot) for spot in spots]
+    place_lacks = options.near is None and options.match.within is None
+    hints = (
+        (camera.gsd_m == usual.gsd_m, "the size of a pixel", "5 %", "(--gsd)", scaled, math.log(1.05)),
+        (camera.heading is None, "the heading", "5 degrees", "(--heading)", turned, 5.0),
+        (place_lacks, "the place", "200 m", "(--near)", away, 200.0),
+    )
+    helps = []
+    for lacks, name, precision, option, apart, most in hints:
+        left = f"{sum(gap <= most for gap in apart)} of {len(listed)} places"
+        known = f"{name} to {precision} {option} would leave {left}" if len(listed) > 1 else f"{name} {option}"
+        helps += [known] * lacks
+    helps += ["a search with full effort"] * (options.effort == "quick")
+    return f"{', '.join([*helps, 'more roads in view'])} or another map may help"
 
 
 def _lead(score: float, needed: float) -> str:

@@ -261,15 +261,18 @@ def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
 
 
 @pytest.mark.slow
-def test_streets_around_are_looked_at_only_where_the_places_met_and_the_blocks_beside_leave_a_lead(
-    even, broken, monkeypatch
+@pytest.mark.parametrize(("certain", "farther"), [(np.inf, [(rivals._AROUND,)]), (0.0, [])])
+def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_that_may_be_lost(
+    even, broken, monkeypatch, certain, farther
 ):
     """A block beside may be the place, whether or not the best one that was met leads."""
     looked = []
+    monkeypatch.setattr(rivals, "_CERTAIN", certain)
+    monkeypatch.setattr(rivals, "_REPEATING", 0.0)
     monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[4:]) or [])
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
-    assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), (rivals._AROUND,)]
+    assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), *farther]
 
 
 # --- traced roads and the picture -------------------------------------------------------------------------------------
@@ -282,7 +285,7 @@ def test_streets_around_are_looked_at_only_where_the_places_met_and_the_blocks_b
         (5.0, 2.0, True, 6.0),
         (2.0, 5.0, False, 3.0),  # or against
         (-1.0, 5.0, False, 5.0),
-        (-1.0, 5.0, True, -1.0),  # a grid turned over: traced roads speak against the picture's place
+        (-1.0, 5.0, True, 5.0),
         (13.0, None, True, 13.0),  # beyond doubt: the picture is not asked
     ],
 )

@@ -227,6 +227,8 @@ def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camer
 def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
     best = judge(query, searched("a", (1.5, 300.0), (0.5, 5000.0)))
     assert (best.status, best.center) == ("not_located", None)
+    assert "the heading to 5 degrees (--heading) would leave 2 of 2 places" in best.reason
+    assert "the place to 200 m (--near) would leave 1 of 2 places, more roads in view or another map" in best.reason
     assert [alternative.log10_odds for alternative in best.alternatives] == [1.5, 0.5]
 
 
