@@ -159,11 +159,6 @@ class Rivals:
         return best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
 
     @property
-    def _worth_looking(self) -> float:
-        """Least lead of a place that is compared with places farther away."""
-        return _WORTH_LOOKING * self.needed
-
-    @property
     def _by_chance(self) -> float:
         """Score that a place loses: the larger the map, the more places may lead all places around them by chance."""
         return 2.0 * math.log10(larger(self.ledger.n_reference))
@@ -195,7 +190,7 @@ class Rivals:
             others += _around(picture, best.matrix, reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.worth, default=None)
             lead = worth - max(0.0 if rival is None else rival.worth, 0.0)
-            if not self._worth_looking <= lead < _CERTAIN:
+            if not _WORTH_LOOKING * self.needed <= lead < _CERTAIN:
                 break
         lead = lead * max(1.0 - self.doubt(estimator, best) / _DISBELIEVED, 0.0) - self._by_chance
         if rival is None:
@@ -268,12 +263,13 @@ class Rivals:
         met = (Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known)
         rivals = list(filter(is_rival, met))
         standing = stand(rivals)
-        if standing.log10_lead < self._worth_looking and estimator.nearby(best) < _REPEATING * worth:
+        leads = standing.log10_lead >= _WORTH_LOOKING * self.needed
+        if not leads and estimator.nearby(best) < _REPEATING * worth:
             return standing
-        for around in _NEARBY, _AROUND:  # a neighbouring block may be the place
+        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(matrix, evidence, compare, estimator.options, around))
             standing = stand(rivals)
-            if not self._worth_looking <= standing.log10_lead < _CERTAIN:
+            if standing.is_beaten or standing.log10_lead >= _CERTAIN:
                 break
         return standing
 
