@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 from typing import Any, NoReturn
 
 __all__ = ["MAX_PICKLE", "PlainUnpickler", "dump_plain", "load_plain", "require_plain"]
@@ -15,32 +16,16 @@ __all__ = ["MAX_PICKLE", "PlainUnpickler", "dump_plain", "load_plain", "require_
 MAX_PICKLE = 1 << 20
 _MAX_DEPTH = 16
 
-# Opcodes of a protocol-5 pickle of plain values, written without a memo, by the size of their arguments. None looks
-# up a name, calls, or refers back; and without back references what comes out is a tree in proportion to the pickle.
+#: Opcodes of a protocol-5 pickle of plain values, written without a memo. None looks up a name, calls, or refers back;
+#: and without back references what comes out is a tree in proportion to the pickle.
 _OPCODES = {
-    pickle.PROTO: 1,
-    pickle.FRAME: 8,
-    pickle.MARK: 0,
-    pickle.STOP: 0,
-    pickle.EMPTY_DICT: 0,
-    pickle.SETITEM: 0,
-    pickle.SETITEMS: 0,
-    pickle.EMPTY_LIST: 0,
-    pickle.APPEND: 0,
-    pickle.APPENDS: 0,
-    pickle.NONE: 0,
-    pickle.NEWTRUE: 0,
-    pickle.NEWFALSE: 0,
-    pickle.BININT: 4,
-    pickle.BININT1: 1,
-    pickle.BININT2: 2,
-    pickle.BINFLOAT: 8,
+    *("PROTO", "FRAME", "MARK", "STOP", "EMPTY_DICT", "SETITEM", "SETITEMS", "EMPTY_LIST", "APPEND", "APPENDS", "NONE"),
+    *("NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "BINFLOAT", "LONG1", "SHORT_BINUNICODE", "BINUNICODE"),
 }
-_SIZED_OPCODES = {pickle.LONG1: 1, pickle.SHORT_BINUNICODE: 1, pickle.BINUNICODE: 4}
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """Unpickler whose allow-list is empty: the second lock behind `_opcode_problem`."""
+    """Unpickler whose allow-list is empty: the second lock behind `_require_opcodes`."""
 
     def find_class(self, module: str, name: str) -> NoReturn:
         """Refuse every name."""
@@ -93,22 +78,15 @@ def dump_plain(value: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _opcode_problem(pickled: bytes) -> str:
-    """Walk over a pickle without running it; '' when it holds only plain opcodes and ends with its STOP."""
-    at = 0
-    while at < len(pickled):
-        opcode = pickled[at : at + 1]
-        at += 1
-        if opcode in _OPCODES:
-            at += _OPCODES[opcode]
-        elif opcode in _SIZED_OPCODES:
-            width = _SIZED_OPCODES[opcode]
-            at += width + int.from_bytes(pickled[at : at + width], "little")
-        else:
-            return f"opcode {opcode!r} is not allowed"
-        if opcode == pickle.STOP:
-            return "" if at == len(pickled) else "something follows its end"
-    return "it is truncated"
+def _require_opcodes(pickled: bytes) -> None:
+    """Walk over a pickle without running it; raise `ValueError` unless all is plain opcodes and it ends with STOP."""
+    end = 0
+    for opcode, _, at in pickletools.genops(pickled):
+        if opcode.name not in _OPCODES:
+            raise ValueError(f"opcode {opcode.name} is not allowed")
+        end = int(at or 0) + 1
+    if end < len(pickled):
+        raise ValueError("something follows its end")
 
 
 def load_plain(pickled: bytes) -> dict[str, Any]:
@@ -119,21 +97,11 @@ def load_plain(pickled: bytes) -> dict[str, Any]:
     ValueError
         `dump_plain` did not write them.
     """
-    problem = _opcode_problem(pickled)
-    if problem:
-        raise ValueError(f"its pickle is not one that roadgeo writes: {problem}")
     try:
+        _require_opcodes(pickled)
         value = PlainUnpickler(io.BytesIO(pickled)).load()
         require_plain(value)
-    except (
-        pickle.UnpicklingError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        LookupError,
-        EOFError,
-        OverflowError,
-    ) as error:
+    except (pickle.PickleError, TypeError, ValueError, AttributeError, LookupError, EOFError, OverflowError) as error:
         raise ValueError(f"its pickle is not one that roadgeo writes: {error}") from error
     if type(value) is not dict:
         raise ValueError("its pickle holds no dict")
