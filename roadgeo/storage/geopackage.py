@@ -10,7 +10,7 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing
-from roadgeo.storage.geopackage_sql import NOW, RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
+from roadgeo.storage.geopackage_sql import RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
 from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
@@ -106,14 +106,10 @@ def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
     OSError
         The file cannot be written.
     """
-    tables = [_Table.of(layer) for layer in layers]
-    srs_ids = _srs_ids(tables)
     try:
         # Made in memory and written at once: on disk, SQLite writes page by page, many of them several times.
-        with closing(sqlite3.connect(":memory:")) as empty, closing(sqlite3.connect(":memory:")) as database:
-            empty.deserialize(_empty(tuple(tables)))
-            empty.backup(database)  # a database read from bytes may not grow beyond a gigabyte
-            _fill_tables(database, tables, layers, srs_ids)
+        with closing(sqlite3.connect(":memory:")) as database:
+            add_layers(database, layers)
             content = database.serialize()
     except sqlite3.Error as error:
         raise OutputError(f"cannot make a GeoPackage: {error}; please report it") from error
@@ -134,11 +130,25 @@ def add_layers(
     sqlite3.Error
         The file cannot be written.
     """
-    tables = [_Table.of(layer) for layer in layers]
-    srs_ids = _srs_ids(tables)
-    database.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;")
-    _make_tables(database, tables, srs_ids)
-    _fill_tables(database, tables, layers, srs_ids, advance)
+    srs_ids, n_rows = _srs_ids(layers), [max(map(len, layer.columns.values()), default=0) for layer in layers]
+    database.executescript(f"PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; {SCHEMA}")
+    for crs, srs_id in srs_ids.items():
+        if crs != PIXELS:
+            name, code, definition = _describe_crs(crs)
+            organization = "NONE" if code is None else "EPSG"
+            entry = (name, srs_id, organization, srs_id, definition)
+            database.execute("INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')", entry)
+    for n, layer in enumerate(layers):
+        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
+        _add_layer(database, layer, srs_ids.get(layer.crs, 0))
+    if styled := [(layer.name, layer.name, layer.style) for layer in layers if layer.style]:
+        database.executescript(STYLES_SCHEMA)
+        database.executemany(
+            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
+            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+            styled,
+        )
+    database.commit()
 
 
 def layer_names(path: str | os.PathLike[str]) -> list[str]:
@@ -212,29 +222,9 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Table:
-    """An empty layer; `columns` are (name, SQL type)."""
-
-    name: str
-    geometry_type: GeometryType | None
-    columns: tuple[tuple[str, str], ...]
-    crs: str
-    styled: bool
-    description: str
-    indexed: bool
-
-    @classmethod
-    def of(cls, layer: Layer) -> _Table:
-        columns = tuple((name, _sql_type(values)) for name, values in layer.columns.items())
-        return cls(
-            layer.name, layer.geometry_type, columns, layer.crs, bool(layer.style), layer.description, layer.indexed
-        )
-
-
-def _srs_ids(tables: Sequence[_Table]) -> dict[str, int]:
+def _srs_ids(layers: Sequence[Layer]) -> dict[str, int]:
     """Return a number for each CRS: its EPSG code, else upwards from `_CUSTOM_SRS_ID`."""
-    used = dict.fromkeys(["EPSG:4326", *(table.crs for table in tables if table.geometry_type)])
+    used = dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)])
     codes = {crs: -1 if crs == PIXELS else _describe_crs(crs)[1] for crs in used}
     return {crs: _CUSTOM_SRS_ID + n if code is None else code for n, (crs, code) in enumerate(codes.items())}
 
@@ -251,99 +241,51 @@ def _describe_crs(crs: str) -> tuple[str, int | None, str]:
         raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error
 
 
-@lru_cache(maxsize=8)
-def _empty(tables: tuple[_Table, ...]) -> bytes:
-    """Make a GeoPackage without rows: results have the same tables, which take as long to make as to fill."""
-    with closing(sqlite3.connect(":memory:")) as database:
-        _make_tables(database, tables, _srs_ids(tables))
-        return database.serialize()
-
-
-def _make_tables(database: sqlite3.Connection, tables: Sequence[_Table], srs_ids: Mapping[str, int]) -> None:
-    database.executescript(SCHEMA)
-    for crs, srs_id in srs_ids.items():
-        if crs != PIXELS:
-            name, code, definition = _describe_crs(crs)
-            organization = "NONE" if code is None else "EPSG"
-            entry = (name, srs_id, organization, srs_id, definition)
-            database.execute("INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')", entry)
-    for table in tables:
-        _make_table(database, table, srs_ids.get(table.crs, 0))
-    if any(table.styled for table in tables):
-        database.executescript(STYLES_SCHEMA)
-    database.commit()
-
-
-def _make_table(database: sqlite3.Connection, table: _Table, srs_id: int) -> None:
+def _add_layer(database: sqlite3.Connection, layer: Layer, srs_id: int) -> None:
+    """Make the table of a layer with its rows, and with its spatial index."""
+    kind, types = layer.geometry_type, {name: _sql_type(values) for name, values in layer.columns.items()}
     declared = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]
-    declared += [f"geom {table.geometry_type}"] if table.geometry_type else []
-    declared += [f"{_quoted(name)} {sql_type}" for name, sql_type in table.columns]
-    database.execute(f"CREATE TABLE {_quoted(table.name)} ({', '.join(declared)})")
-    database.execute(
-        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES (?, ?, ?, ?, ?)",
-        (table.name, "features" if table.geometry_type else "attributes", table.name, table.description, srs_id),
-    )
-    if not table.geometry_type:
-        return
-    entry = (table.name, table.geometry_type, srs_id)
-    database.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", entry)
-    if not table.indexed:
-        return
-    # Without SQLite's rtree module the file is as valid, only slower to pan over.
-    with suppress(sqlite3.OperationalError):
-        database.execute(f'CREATE VIRTUAL TABLE "rtree_{table.name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
-        database.execute(
-            "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
-            " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
-            (table.name,),
-        )
-
-
-def _fill_tables(
-    database: sqlite3.Connection,
-    tables: Sequence[_Table],
-    layers: Sequence[Layer],
-    srs_ids: Mapping[str, int],
-    advance: Callable[[float], None] = lambda _: None,
-) -> None:
-    """Give empty tables the rows of their layers; `advance` receives the share of them that is written."""
-    n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
-    indexed = {name for (name,) in database.execute("SELECT table_name FROM gpkg_extensions")}
-    database.execute(f"UPDATE gpkg_contents SET last_change = {NOW}")
-    for n, (table, layer) in enumerate(zip(tables, layers, strict=True)):
-        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
-        bounds = _fill_table(database, table, layer, srs_ids.get(table.crs, 0))
-        if len(bounds):
-            extent = [*bounds[:, [0, 2]].min(axis=0).tolist(), *bounds[:, [1, 3]].max(axis=0).tolist()]
-            update = "UPDATE gpkg_contents SET min_x = ?, min_y = ?, max_x = ?, max_y = ? WHERE table_name = ?"
-            database.execute(update, (*extent, table.name))
-            if table.name in indexed:
-                boxes = zip(range(1, len(bounds) + 1), *bounds.T.tolist(), strict=True)
-                database.executemany(f'INSERT INTO "rtree_{table.name}_geom" VALUES (?, ?, ?, ?, ?)', boxes)
-        if table.name in indexed:
-            database.executescript(RTREE_TRIGGERS.format(t=table.name))
-    if styled := [(layer.name, layer.name, layer.style) for layer in layers if layer.style]:
-        database.executemany(
-            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
-            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-            styled,
-        )
-    database.commit()
-
-
-def _fill_table(database: sqlite3.Connection, table: _Table, layer: Layer, srs_id: int) -> FloatArray:
-    """Insert a layer's rows and return their (N, 4) bounds, or none for a table without geometry."""
-    typed = zip(layer.columns.values(), table.columns, strict=True)
-    values: list[Sequence[Any]] = [_sql_values(column, sql_type) for column, (_, sql_type) in typed]
+    declared += [f"geom {kind}"] if kind else []
+    declared += [f"{_quoted(name)} {sql_type}" for name, sql_type in types.items()]
+    database.execute(f"CREATE TABLE {_quoted(layer.name)} ({', '.join(declared)})")
+    values: list[Sequence[Any]] = [_sql_values(column, types[name]) for name, column in layer.columns.items()]
+    extent: list[float | None] = [None] * 4
     bounds = np.empty((0, 4))
-    if table.geometry_type:
-        blobs, bounds = _encode(table.geometry_type, layer.geometries, srs_id)
+    if kind:
+        blobs, bounds = _encode(kind, layer.geometries, srs_id)
         values.insert(0, blobs)
+    if len(bounds):
+        extent = [*bounds[:, [0, 2]].min(axis=0).tolist(), *bounds[:, [1, 3]].max(axis=0).tolist()]
     if values:
         marks = ", ".join("?" * (len(values) + 1))
         rows = zip(range(1, len(values[0]) + 1), *values, strict=True)
-        database.executemany(f"INSERT INTO {_quoted(table.name)} VALUES ({marks})", rows)
-    return bounds
+        database.executemany(f"INSERT INTO {_quoted(layer.name)} VALUES ({marks})", rows)
+    database.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id, min_x, min_y, max_x, max_y)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (layer.name, "features" if kind else "attributes", layer.name, layer.description, srs_id, *extent),
+    )
+    if kind:
+        entry = (layer.name, kind, srs_id)
+        database.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", entry)
+    if kind and layer.indexed:
+        _add_index(database, layer.name, bounds)
+
+
+def _add_index(database: sqlite3.Connection, name: str, bounds: FloatArray) -> None:
+    """Index the rows of a layer by their (N, 4) bounds."""
+    try:
+        database.execute(f'CREATE VIRTUAL TABLE "rtree_{name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
+    except sqlite3.OperationalError:
+        return  # without SQLite's rtree module the file is as valid, only slower to pan over
+    database.execute(
+        "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
+        " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
+        (name,),
+    )
+    boxes = zip(range(1, len(bounds) + 1), *bounds.T.tolist(), strict=True)
+    database.executemany(f'INSERT INTO "rtree_{name}_geom" VALUES (?, ?, ?, ?, ?)', boxes)
+    database.executescript(RTREE_TRIGGERS.format(t=name))
 
 
 def _sql_type(values: Sequence[Any] | AnyArray) -> str:

@@ -1,8 +1,6 @@
 """The SQL of a GeoPackage: its tables, QGIS's tables of styles, and the triggers that keep spatial indexes true."""
 
-__all__ = ["NOW", "RTREE_TRIGGERS", "SCHEMA", "STYLES_SCHEMA"]
-
-NOW = "strftime('%Y-%m-%dT%H:%M:%fZ','now')"
+__all__ = ["RTREE_TRIGGERS", "SCHEMA", "STYLES_SCHEMA"]
 
 SCHEMA = """
 PRAGMA application_id = 0x47504B47;
@@ -38,40 +36,23 @@ CREATE TABLE layer_styles (
 INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles');
 """
 
-# As the GeoPackage standard spells them (annex F.3); a writer that edits the layer keeps the index true through them.
-RTREE_TRIGGERS = """
-CREATE TRIGGER "rtree_{t}_geom_insert" AFTER INSERT ON "{t}"
-  WHEN (new."geom" NOT NULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update1" AFTER UPDATE OF "geom" ON "{t}"
-  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update2" AFTER UPDATE OF "geom" ON "{t}"
-  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-END;
-CREATE TRIGGER "rtree_{t}_geom_update3" AFTER UPDATE ON "{t}"
-  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update4" AFTER UPDATE ON "{t}"
-  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id IN (OLD."fid", NEW."fid");
-END;
-CREATE TRIGGER "rtree_{t}_geom_delete" AFTER DELETE ON "{t}"
-  WHEN old."geom" NOT NULL
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-END;
-"""
+_PUT = """INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
+    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));"""
+_DROP = 'DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";'
+_DROP_BOTH = 'DELETE FROM "rtree_{t}_geom" WHERE id IN (OLD."fid", NEW."fid");'
+_HAS_GEOMETRY = '(NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))'
+_HAS_NONE = '(NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))'
+_STAYS, _MOVES = 'OLD."fid" = NEW."fid" AND ', 'OLD."fid" != NEW."fid" AND '
+
+# As the GeoPackage standard has them (annex F.3); a writer that edits the layer keeps the index true through them.
+RTREE_TRIGGERS = "".join(
+    f'CREATE TRIGGER "rtree_{{t}}_geom_{name}" AFTER {event} ON "{{t}}" WHEN {when}\nBEGIN\n  {steps}\nEND;\n'
+    for name, event, when, steps in (
+        ("insert", "INSERT", _HAS_GEOMETRY, _PUT),
+        ("update1", 'UPDATE OF "geom"', _STAYS + _HAS_GEOMETRY, _PUT),
+        ("update2", 'UPDATE OF "geom"', _STAYS + _HAS_NONE, _DROP),
+        ("update3", "UPDATE", _MOVES + _HAS_GEOMETRY, _DROP + _PUT),
+        ("update4", "UPDATE", _MOVES + _HAS_NONE, _DROP_BOTH),
+        ("delete", "DELETE", 'OLD."geom" NOTNULL', _DROP),
+    )
+)
