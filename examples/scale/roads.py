@@ -19,7 +19,7 @@ from maps import APART_DEG, transformation
 from pyproj import CRS
 
 from roadgeo.geometry.projection import LocalPlane, to_lonlat
-from roadgeo.storage.files import publish, staging
+from roadgeo.storage.files import replacing
 
 
 def copy(lines: np.ndarray, crs: str, k: int) -> np.ndarray:
@@ -44,13 +44,11 @@ def main() -> None:
     column = {"encoding": "WKB", "geometry_types": ["LineString"], "crs": CRS("OGC:CRS84").to_json_dict()}
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
     schema = pa.schema([("highway", pa.string()), ("geometry", pa.binary())], {"geo": json.dumps(geo)})
-    with staging(given.out) as folder:
-        with pq.ParquetWriter(folder / given.out.name, schema) as writer:
-            for k in range(given.count):
-                wkb = shapely.to_wkb(copy(lines, crs, k))
-                writer.write_table(pa.table([table["highway"], pa.array(wkb, pa.binary())], schema))
-                print(f"copy {k}: {len(wkb):,} roads", flush=True)
-        publish(folder / given.out.name, given.out)
+    with replacing(given.out) as staged, pq.ParquetWriter(staged, schema) as writer:
+        for k in range(given.count):
+            wkb = shapely.to_wkb(copy(lines, crs, k))
+            writer.write_table(pa.table([table["highway"], pa.array(wkb, pa.binary())], schema))
+            print(f"copy {k}: {len(wkb):,} roads", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,22 +18,22 @@ from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.geometry.frame import polygon_area
 from roadgeo.reference.index_file import (
     FORMAT_VERSION,
-    dump_index,
     read_format_version,
     read_index,
     read_manifest,
     remedy,
+    write_index,
 )
 from roadgeo.reference.network_file import (
-    dump_network,
     network_digest,
     read_meta,
     read_network,
     stored_digest,
+    write_network,
 )
 from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import publish, replacing, staging, sync_file
+from roadgeo.storage.files import replacing
 
 __all__ = [
     "Freshness",
@@ -50,6 +50,9 @@ __all__ = [
 
 #: Content of an index file: plain values, and arrays by name.
 IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
+
+#: What distinguishes each file of a reference from one that takes its place; None for a missing file.
+Identities: TypeAlias = list[tuple[int, int] | None]
 
 #: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage
 #: from which to build it again.
@@ -106,16 +109,11 @@ def write_reference(
     """
     paths = reference_paths(path)
     meta, arrays = parts
-    with staging(paths.geopackage) as folder:
-        staged = reference_paths(folder / paths.geopackage.name)
-        dump_network(staged.geopackage, network, say)
-        dump_index(staged.index, meta, arrays, _about(network, meta))
-        sync_file(staged.geopackage)
-        sync_file(staged.index)
+    with replacing(paths.index) as index, replacing(paths.geopackage) as geopackage:  # left last first
+        write_network(geopackage, network, say)
+        write_index(index, meta, arrays, _about(network, meta))
         # Without its index a GeoPackage is still a whole reference, with the index of another one it is not.
         paths.index.unlink(missing_ok=True)
-        staged.geopackage.replace(paths.geopackage)
-        publish(staged.index, paths.index)
     return paths
 
 
@@ -182,13 +180,8 @@ def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], I
         The index cannot be written.
     """
     paths = reference_paths(path)
-    before = identities(paths.geopackage)
-    network = read_network(paths.geopackage)
-    meta, arrays = build(network)
-    with replacing(paths.index) as staged:
-        dump_index(staged, meta, arrays, _about(network, meta))
-        if identities(paths.geopackage) != before:
-            raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
+    network, before = _read(paths)
+    _keep(paths, network, build(network), before)
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
@@ -214,7 +207,7 @@ def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
 
 
 def reference_digest(path: str | os.PathLike[str]) -> str:
-    """Return the digest of the intersections that a reference's index was built from; "" without an index to read.
+    """Return the digest of the intersections that an index was built from; "" where none of this format is there.
 
     Raises
     ------
@@ -222,7 +215,8 @@ def reference_digest(path: str | os.PathLike[str]) -> str:
         The index is damaged.
     """
     index = reference_paths(path).index
-    return str(read_manifest(index)["about"].get("network", "")) if index.is_file() else ""
+    is_read = index.is_file() and read_format_version(index) == FORMAT_VERSION
+    return str(read_manifest(index)["about"].get("network", "")) if is_read else ""
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
@@ -230,25 +224,40 @@ def reference_digest(path: str | os.PathLike[str]) -> str:
 
 def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
     """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
+    network, before = _read(paths)
+    parts = rebuild(network)
+    # A reference in a read-only folder serves as well; it only costs this time at every opening.
+    with contextlib.suppress(OutputError, IndexFormatError):
+        _keep(paths, network, parts, before, may_exist=False)
+    return parts
+
+
+def _read(paths: ReferencePaths) -> tuple[RoadNetwork, Identities]:
+    """Return the network of a reference, and the identities of the files by which it is known."""
     before = identities(paths.geopackage)
     network = read_network(paths.geopackage)
     if identities(paths.geopackage) != before:
         raise IndexFormatError(f"{paths.geopackage} was replaced while it was read; try again")
-    meta, arrays = rebuild(network)
-    # A reference in a read-only folder serves as well; it only costs this time at every opening.
-    with contextlib.suppress(OutputError), staging(paths.index) as folder:
-        staged = folder / paths.index.name
-        dump_index(staged, meta, arrays, _about(network, meta))
-        if identities(paths.geopackage) == before:
+    return network, before
+
+
+def _keep(
+    paths: ReferencePaths, network: RoadNetwork, parts: IndexParts, before: Identities, may_exist: bool = True
+) -> None:
+    """Write the index of a network, unless the reference is another by now."""
+    meta, arrays = parts
+    with replacing(paths.index, may_exist=may_exist) as staged:
+        write_index(staged, meta, arrays, _about(network, meta))
+        if identities(paths.geopackage) != before:
+            raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
+        if not may_exist:
             paths.index.unlink(missing_ok=True)
-            publish(staged, paths.index, replace=False)
-    return meta, arrays
 
 
-def identities(path: str | os.PathLike[str]) -> list[tuple[int, int] | None]:
+def identities(path: str | os.PathLike[str]) -> Identities:
     """Return an identity of each file of a reference, which changes when it is replaced; None for a missing file."""
     paths = reference_paths(path)
-    found: list[tuple[int, int] | None] = []
+    found: Identities = []
     for path in (paths.geopackage, paths.index):
         try:
             status = path.stat()

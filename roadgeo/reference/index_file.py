@@ -44,12 +44,10 @@ from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import IndexFormatError, RoadgeoError
 from roadgeo.reference.plain_values import MAX_PICKLE, dump_plain, load_plain, require_plain
-from roadgeo.storage.files import replacing
 
 __all__ = [
     "FORMAT_VERSION",
     "check_index",
-    "dump_index",
     "read_format_version",
     "read_index",
     "read_manifest",
@@ -75,17 +73,12 @@ _MAX_DIMENSIONS = 4
 
 
 def write_index(
-    path: str | os.PathLike[str],
-    meta: Mapping[str, Any],
-    arrays: Mapping[str, AnyArray],
-    about: Mapping[str, Any] | None = None,
+    path: Path, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write an index file; whole or not at all.
+    """Write an index file in place, for callers that stage it (see `storage.files.replacing`).
 
     Parameters
     ----------
-    path : path
-        Replaced when it exists; readers keep the old file that they have open.
     meta : dict
         Plain values (dict with str keys, list, str, 64-bit int, float, bool, None) that the arrays' owner needs back.
     arrays : mapping of str to ndarray
@@ -95,19 +88,11 @@ def write_index(
 
     Raises
     ------
-    OutputError
-        When the disk is full, the folder is missing or not writable.
+    OSError
+        The disk is full, the folder is missing or not writable.
     TypeError
-        When a value or array is of a kind that the format does not store.
+        A value or array is of a kind that the format does not store.
     """
-    with replacing(path) as staged:
-        dump_index(staged, meta, arrays, about)
-
-
-def dump_index(
-    path: Path, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], about: Mapping[str, Any] | None = None
-) -> None:
-    """Write an index to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
     chunks: list[bytes | memoryview] = [dump_plain(dict(meta))]
     entries = []
     offset = _aligned(len(chunks[0]))
@@ -127,7 +112,7 @@ def dump_index(
     }
     require_plain(manifest)
     header = _header(json.dumps(manifest, allow_nan=False).encode())
-    with path.open("xb") as file:
+    with path.open("wb") as file:
         for chunk in (header, *chunks):
             file.write(chunk)
             file.write(bytes(-len(chunk) % _ALIGNMENT))

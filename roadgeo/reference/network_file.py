@@ -30,13 +30,11 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer, require_tables
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, name_features, seen_from, widen_by
 
 __all__ = [
     "computed_digest",
-    "dump_network",
     "network_digest",
     "not_a_reference",
     "read_meta",
@@ -112,22 +110,16 @@ INSERT INTO gpkg_extensions VALUES
 """
 
 
-def write_network(path: str | os.PathLike[str], network: RoadNetwork) -> None:
-    """Write a network; whole or not at all.
+def write_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> None:
+    """Write a network to a new file in place, for callers that stage it (see `storage.files.replacing`).
 
     Raises
     ------
-    OutputError
-        When the disk is full, the folder is missing or not writable.
+    OSError
+        The disk is full, the folder is missing or not writable.
     CrsError
-        When the plane's CRS is unknown.
+        The plane's CRS is unknown.
     """
-    with replacing(path) as staged:
-        dump_network(staged, network)
-
-
-def dump_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> None:
-    """Write a network to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
     meta = _stored_meta(network)
     layers = []
     for layer in _map_layers(network):

@@ -24,7 +24,7 @@ try:
 except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["make_folder", "publish", "replacing", "staging", "sync_file", "write_bytes", "write_text", "writing"]
+__all__ = ["make_folder", "replacing", "sync_file", "write_bytes", "write_text", "writing"]
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
@@ -69,48 +69,40 @@ def make_folder(folder: str | os.PathLike[str]) -> None:
 
 
 @contextlib.contextmanager
-def staging(target: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a folder on the target's disk for unfinished files; it is gone at the end, whatever happens.
-
-    Leftovers of writers that died are removed on the way.
-
-    Parameters
-    ----------
-    target : path
-        The file to be written. Its folder must exist.
-
-    Raises
-    ------
-    OutputError
-        When the disk is full, the folder is missing or not writable.
-    """
-    with writing(target):
-        _remove_leftovers(Path(target).parent)
-        with _locked_folder(Path(target).parent) as folder:
-            yield folder
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], sync: bool = True, *, may_exist: bool = True) -> Iterator[Path]:
     """Yield a file of the same name in a staging folder; on success it takes the place of `path`.
 
     With `sync` the content is on the disk first: after a power cut the name stands for the old content or the new, not
-    for an empty file. Leftovers are removed once for each folder, for many files may be written to it.
+    for an empty file. Leftovers of writers that died are removed once for each folder, for many files may be written to
+    it.
+
+    Parameters
+    ----------
+    path : path
+        The file to be written. Its folder must exist.
+    may_exist : bool
+        False: it is an error where there is a file by then.
 
     Raises
     ------
     OutputError
-        As of `staging`.
+        The disk is full, the folder is missing or not writable.
     """
     target = Path(path)
     try:
         with writing(target):
             _remove_leftovers_once(target.parent)
             with _locked_folder(target.parent) as folder:
-                yield folder / target.name
+                staged = folder / target.name
+                yield staged
                 if sync:
-                    sync_file(folder / target.name)
-                (folder / target.name).replace(target)
+                    sync_file(staged)
+                if may_exist:
+                    staged.replace(target)
+                else:
+                    _rename_to_new(staged, target)
+                if sync:
+                    _sync_folder(target.parent)
     except OutputError as error:
         raise OutputError(re.sub(_STAGED, "", str(error))) from error
 
@@ -124,22 +116,6 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
 def write_text(path: str | os.PathLike[str], content: str) -> None:
     """Write a whole UTF-8 text file with line feeds in one step (see `replacing`)."""
     write_bytes(path, content.encode())
-
-
-def publish(staged: Path, target: str | os.PathLike[str], *, replace: bool = True) -> None:
-    """Sync a finished file of a staging folder to disk and rename it over `target`.
-
-    Raises
-    ------
-    FileExistsError
-        There is a target and `replace` is False.
-    """
-    sync_file(staged)
-    if replace:
-        staged.replace(target)
-    else:
-        _rename_to_new(staged, Path(target))
-    _sync_folder(Path(target).parent)
 
 
 def _rename_to_new(staged: Path, target: Path) -> None:

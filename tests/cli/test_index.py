@@ -134,7 +134,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
 
     streets = write_streets(tmp_path / "a.geojson")
     out = tmp_path / "out"
-    monkeypatch.setattr("roadgeo.reference.files.sync_file", interrupt)  # both files are written, but not in place
+    monkeypatch.setattr("roadgeo.storage.files.sync_file", interrupt)  # both files are written, but not in place
     assert index("--roads", streets, "--out", out / "a.gpkg", quiet=True) == 130
     assert capsys.readouterr().err.strip() == "Interrupted."
     assert not list(out.iterdir())

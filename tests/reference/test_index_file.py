@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from roadgeo.errors import IndexFormatError, OutputError, RoadgeoError
+from roadgeo.errors import IndexFormatError, RoadgeoError
 from roadgeo.reference import index_file, plain_values
 from roadgeo.reference.index_file import FORMAT_VERSION, check_index, read_index, read_manifest, write_index
 
@@ -402,11 +402,6 @@ def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"nowhere.*create the folder"):
-        write_index(tmp_path / "nowhere" / "town.index", {}, {})
 
 
 def test_the_unpickler_knows_no_names(tmp_path: Path) -> None:

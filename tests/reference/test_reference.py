@@ -7,13 +7,13 @@ import geopandas
 import pytest
 from worlds.fenway import streets
 
+from roadgeo.api import build_reference
 from roadgeo.errors import IndexFormatError
 from roadgeo.matching.index import IndexOptions
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import BuildOptions, open_reference, stored_options
 from roadgeo.roads.intersections import IntersectionOptions
 from roadgeo.roads.simplification import SimplifyOptions
-from roadgeo.workflows import build_reference
 
 OPTIONS = BuildOptions(
     SimplifyOptions(merge_radius=10.0, max_passes=2),

@@ -10,18 +10,8 @@ from pathlib import Path
 import pytest
 
 from roadgeo.errors import OutputError
-from roadgeo.storage.files import publish, replacing, staging, write_text, writing
-
-
-def test_a_file_appears_when_published(tmp_path: Path) -> None:
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-    with staging(target) as folder:
-        (folder / "a.txt").write_text("new")
-        assert target.read_text() == "old"
-        publish(folder / "a.txt", target)
-    assert target.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [target]
+from roadgeo.storage import files
+from roadgeo.storage.files import replacing, write_text, writing
 
 
 def test_a_file_that_must_not_replace_another(tmp_path: Path) -> None:
@@ -32,9 +22,8 @@ def write_twice(tmp_path: Path, message: str) -> None:
     target = tmp_path / "a.txt"
     for content in ("first", "second"):
         with pytest.raises(OutputError, match=message) if target.exists() else nullcontext():  # noqa: SIM117
-            with staging(target) as folder:
-                (folder / "a.txt").write_text(content)
-                publish(folder / "a.txt", target, replace=False)
+            with replacing(target, may_exist=False) as staged:
+                staged.write_text(content)
     assert target.read_text() == "first"
     assert list(tmp_path.iterdir()) == [target]
 
@@ -50,8 +39,8 @@ def test_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])
 def test_nothing_is_left_when_writing_fails(tmp_path: Path, error: type[BaseException]) -> None:
     def fail() -> None:
-        with staging(tmp_path / "a.txt") as folder:
-            (folder / "a.txt").write_text("half")
+        with replacing(tmp_path / "a.txt") as staged:
+            staged.write_text("half")
             raise error
 
     with pytest.raises(OutputError if error is OSError else error):
@@ -69,19 +58,19 @@ def test_errors_name_file_cause_and_remedy(number: int, remedy: str) -> None:
 
 
 def test_a_missing_folder_and_a_file_as_folder_are_named(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="create the folder"), staging(tmp_path / "none" / "a.txt"):
+    with pytest.raises(OutputError, match="create the folder"), replacing(tmp_path / "none" / "a.txt"):
         pass
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="not a file"), staging(tmp_path / "file" / "a.txt"):
+    with pytest.raises(OutputError, match="not a file"), replacing(tmp_path / "file" / "a.txt"):
         pass
 
 
 def hold_staging(target: Path) -> subprocess.Popen[bytes]:
     """Start another process that stays in the middle of writing `target`."""
     code = (
-        "import sys, time; from roadgeo.storage.files import staging\n"
-        "with staging(sys.argv[1]) as folder:\n"
-        "    (folder / 'half').write_text('x'); print('ready', flush=True); time.sleep(60)\n"
+        "import sys, time; from roadgeo.storage.files import replacing\n"
+        "with replacing(sys.argv[1]) as staged:\n"
+        "    staged.with_name('half').write_text('x'); print('ready', flush=True); time.sleep(60)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -92,32 +81,29 @@ def hold_staging(target: Path) -> subprocess.Popen[bytes]:
 def test_a_living_writer_is_left_alone_and_a_dead_one_cleared_away(tmp_path: Path) -> None:
     with hold_staging(tmp_path / "other.txt") as process:
         (folder,) = tmp_path.iterdir()
-        with staging(tmp_path / "a.txt"):
-            assert (folder / "half").exists()
+        write_text(tmp_path / "a.txt", "")
+        assert (folder / "half").exists()
         process.send_signal(signal.SIGKILL)
     assert folder.exists()
     (tmp_path / ".roadgeo-abc.tmp").mkdir()  # killed between making the folder and its lock
-    with staging(tmp_path / "a.txt"):
-        assert not folder.exists()
-    assert list(tmp_path.iterdir()) == []
+    files._remove_leftovers_once.cache_clear()
+    write_text(tmp_path / "a.txt", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_foreign_files_of_similar_names_stay(tmp_path: Path) -> None:
     (tmp_path / ".roadgeo-notes.tmp").mkdir()
     (tmp_path / ".roadgeo-notes.tmp" / "mine.txt").touch()
     (tmp_path / "x.tmp").touch()
-    with staging(tmp_path / "a.txt"):
-        pass
-    assert {path.name for path in tmp_path.iterdir()} == {".roadgeo-notes.tmp", "x.tmp"}
+    write_text(tmp_path / "a.txt", "")
+    assert {path.name for path in tmp_path.iterdir()} == {".roadgeo-notes.tmp", "a.txt", "x.tmp"}
 
 
 def test_many_writers_in_one_folder(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from roadgeo.storage.files import staging, publish\n"
-        "target = Path(sys.argv[1])\n"
+        "import sys; from roadgeo.storage import files\n"
         "for i in range(60):\n"
-        "    with staging(target) as folder:\n"
-        "        (folder / 'a').write_text('whole'); publish(folder / 'a', target)\n"
+        "    files._remove_leftovers_once.cache_clear(); files.write_text(sys.argv[1], 'whole')\n"
     )
     writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path / f"{i % 2}.txt")]) for i in range(3)]
     while any(writer.poll() is None for writer in writers):
@@ -163,8 +149,8 @@ def test_planted_links_are_not_followed(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(OutputError, match="exists"):
         write_text(folder / "a.json", "{}")
     write_text(folder / "a.json", "{}")
-    with staging(folder / "b.json"):
-        pass
+    files._remove_leftovers_once.cache_clear()
+    write_text(folder / "b.json", "")
     assert victim.read_text() == "precious"
     assert (folder / "a.json").read_text() == "{}"
     assert not (folder / "a.json").is_symlink()
