@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -15,7 +15,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.hints import apply_hints, read_hint
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, swapped_near
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, digest_of, swapped_near
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.running.answers import Answer
@@ -245,7 +245,7 @@ def locate(
     else:
         sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
-    origin = {"options": changed, "reference_digest": _digest(references, sighting.location)}
+    origin = {"options": changed, "reference_digest": digest_of(references, sighting.location.reference)}
     found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
     indexes = tuple(item.index_of(sighting.location) for item in references)
     picture = picture if sighting.of_photograph else None
@@ -419,15 +419,6 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
 
 def _hint(name: str, value: Any) -> Any:
     return None if value is None else read_hint(name, value)[1]
-
-
-def _digest(references: Sequence[AnyReference], location: Location) -> str:
-    """Return the digest of the reference of a place, else of all; those that were not written have none."""
-    from roadgeo.reference.inspection import reference_digest
-
-    here = [reference for reference in references if reference.name == location.reference][:1] or references
-    paths = [item.index.path if isinstance(item, Reference) else item.path for item in here]
-    return ", ".join(reference_digest(path) for path in paths if path)
 
 
 def _open(reference: References) -> list[AnyReference]:

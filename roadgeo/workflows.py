@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,12 +19,9 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, open_whole
-from roadgeo.roads.kinds import RoadKind
 from roadgeo.roads.network import build_network
 
 if TYPE_CHECKING:
-    import geopandas as gpd
-
     from roadgeo.sources.roads import Roads
 
 __all__ = ["LocateOptions", "build_reference", "explain", "locate"]
@@ -35,45 +31,33 @@ __all__ = ["LocateOptions", "build_reference", "explain", "locate"]
 
 
 def build_reference(
-    roads: Roads | gpd.GeoDataFrame | str | os.PathLike[str],
+    roads: Roads,
     name: str = "",
     options: BuildOptions | None = None,
     *,
     path: str | Path | None = None,
-    kinds: RoadKind = "drivable",
-    tunnels: bool = False,
-    attribution: str | None = None,
     say: Say = say_nothing,
 ) -> Reference:
-    """Build a reference from road lines, as `roadgeo index` does.
+    """Build a reference from roads, as `roadgeo index` does; files and tables give them by `sources.roads`.
 
     Parameters
     ----------
-    roads : Roads, GeoDataFrame or path
-        Lines in any CRS; a path is a road file or a folder of them.
     name : str
         Name of the reference.
     path : path, optional
         Write it there, and open it from there.
-    kinds, tunnels
-        Kinds of roads to take from a table or a file, where it has kinds; `Roads` are taken as they are.
-    attribution : str, optional
-        Attribution beside the map, where the roads have none.
 
     Raises
     ------
-    CrsError, RoadSourceError
-        No CRS; no lines; fewer than three intersections.
+    RoadSourceError
+        Fewer than three intersections.
     OutputError
         It cannot be written.
     """
-    from roadgeo.sources.roads import choose_roads
-
-    chosen = choose_roads(roads, kinds, tunnels, attribution, say)
     warm_up(say, map_only=True)
     options = options or BuildOptions()
-    meta = {"name": name, **chosen.meta}
-    network = build_network(chosen.lines, chosen.plane, meta, options, say, names=chosen.names, kinds=chosen.kinds)
+    meta = {"name": name, **roads.meta}
+    network = build_network(roads.lines, roads.plane, meta, options, say, names=roads.names, kinds=roads.kinds)
     reference = Reference(build_index(network, options.index, say), network)
     if path is None:
         return reference
@@ -98,9 +82,8 @@ def locate(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    options, references = options or LocateOptions(), _as_list(reference)
-    query = _read(mask)
-    return decide(query, _search(query, references, options), options)
+    query, found, options = _search(mask, reference, options)
+    return decide(query, found, options)
 
 
 def explain(
@@ -120,32 +103,24 @@ def explain(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    options, references = options or LocateOptions(), _as_list(reference)
-    query = _read(mask)
-    found = _search(query, references, options, explained=True)
+    query, found, options = _search(mask, reference, options, explained=True)
     stories = tuple(tell(query, one, options) for one in found)
     return Explanation(decide(query, found, options), query.scene, query.graph, stories)
 
 
-def _as_list(reference: AnyReference | Sequence[AnyReference]) -> list[AnyReference]:
+def _search(
+    mask: RoadMask | AnyArray | str | Path,
+    reference: AnyReference | Sequence[AnyReference],
+    options: LocateOptions | None,
+    explained: bool = False,
+) -> tuple[Query, list[Found], LocateOptions]:
+    """Trace a mask, and search all references together for it, within the time that tracing left."""
+    options = options or LocateOptions()
     references = list(reference) if isinstance(reference, Sequence) else [reference]
     if not references:
         raise RoadSourceError("no reference to search: build one with `roadgeo index`")
-    return references
-
-
-def _read(mask: RoadMask | AnyArray | str | Path) -> Query:
     warm_up()
-    return read_query(mask)
-
-
-def _search(
-    query: Query,
-    references: Sequence[AnyReference],
-    options: LocateOptions,
-    explained: bool = False,
-) -> list[Found]:
-    """Search all references together, within the time that tracing left."""
+    query = read_query(mask)
     left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
     parts = [part for one in references for part in one.parts]
-    return search_references(query, parts, options, left, explained)
+    return query, search_references(query, parts, options, left, explained), options

@@ -9,8 +9,8 @@ import cv2
 import pytest
 
 import roadgeo
+from roadgeo.api import build_reference
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
-from roadgeo.workflows import build_reference
 
 MODULES = (
     "roadgeo",

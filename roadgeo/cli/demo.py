@@ -35,6 +35,7 @@ def demo_command(out_dir: str) -> int:
       roadgeo demo
       roadgeo demo --out-dir porto
     """
+    from roadgeo.api import build_reference
     from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.demo import (
         ATTRIBUTION,
@@ -53,7 +54,6 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.running.options import BatchOptions
     from roadgeo.running.tasks import Task
     from roadgeo.storage.files import make_folder, write_bytes
-    from roadgeo.workflows import build_reference
 
     # the sources of the demonstration are left beside its results
     folder, masks, photo = Path(out_dir), demo_masks(), demo_photo()

@@ -34,7 +34,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.projection import transform
 from roadgeo.outputs.names import table_text
 from roadgeo.storage.files import write_text
@@ -240,10 +240,7 @@ def _matrix(row: dict[str, str]) -> FloatArray:
 
 def _from_local(row: dict[str, str], crs: str | None) -> Truth:
     """Read a row whose homography takes pixel centres at integers to metres from a local origin."""
-    shift = np.eye(3)
-    shift[:2, 2] = [float(row[f"centre_{to}"]) - float(row[f"centre_{of}"]) for to, of in ("ex", "ny")]
-    to_center = np.eye(3)
-    to_center[:2, 2] = -0.5
+    origin = [float(row[f"centre_{to}"]) - float(row[f"centre_{of}"]) for to, of in ("ex", "ny")]
     names = {
         "n_intersections": "n_intersections",
         "gsd": "gsd_m",
@@ -252,7 +249,8 @@ def _from_local(row: dict[str, str], crs: str | None) -> Truth:
         "spurious_frac": "false_roads",
     }
     properties = {ours: float(row[theirs]) for theirs, ours in names.items() if row.get(theirs)}
-    return Truth(row["file"], row["kind"], shift @ _matrix(row) @ to_center, crs, (1500, 1500), True, properties)
+    matrix = shift(*origin) @ _matrix(row) @ shift(-0.5, -0.5)
+    return Truth(row["file"], row["kind"], matrix, crs, (1500, 1500), True, properties)
 
 
 def _crs_beside(table: Path) -> str | None:

@@ -14,10 +14,11 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
+from roadgeo.roads.vectorization import road_width
 
-__all__ = ["Mosaic", "chain", "lay_down", "lay_together", "level"]
+__all__ = ["Mosaic", "chain", "lay_down", "lay_together", "level", "road_px"]
 
 
 #: Roads are drawn about so wide, so that large frames do not make a larger mosaic than tracing needs.
@@ -81,6 +82,12 @@ def level(chained: FloatArray, frame: Frame) -> FloatArray:
     levelled = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [line[0], line[1], 1.0]]) @ local @ to_unit
     middle = np.append(frame.center, 1.0)
     return np.asarray(levelled * np.sign(levelled[:, 2] @ middle)[:, None, None])
+
+
+def road_px(masks: Sequence[RoadMask]) -> float:
+    """Return the usual width of a road in frames, pixels."""
+    shown = [road_width(mask) for mask in masks if mask.roads.any()]
+    return float(np.median(shown)) if shown else 1.0
 
 
 def lay_together(masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float) -> Mosaic | None:
@@ -152,10 +159,7 @@ def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray, 
     right, bottom = np.ceil(corners.max(axis=0)).astype(int) + 2
     part = np.s_[top:bottom, left:right]
     # OpenCV counts from pixel centres.
-    inward = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    outward = np.array([[1.0, 0.0, -0.5 - left], [0.0, 1.0, -0.5 - top], [0.0, 0.0, 1.0]])
-    size = roads[part].shape[::-1]
-    warp = outward @ matrix @ inward
+    size, warp = roads[part].shape[::-1], shift(-0.5 - left, -0.5 - top) @ matrix @ shift(0.5, 0.5)
     values = mask.roads.view(np.uint8) * np.uint8(255)
     known = (
         np.full(mask.shape, 255, np.uint8) if mask.observed is None else mask.observed.view(np.uint8) * np.uint8(255)

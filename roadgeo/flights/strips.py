@@ -15,16 +15,15 @@ from itertools import combinations
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo.flights.mosaic import lay_down
+from roadgeo.flights.mosaic import lay_down, road_px
 from roadgeo.flights.motion import TracedMask, between_images, overlay
 from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.reference import Reference
-from roadgeo.roads.vectorization import road_width
 from roadgeo.workflows import locate
 
 __all__ = ["Link", "adjust", "find_links", "find_nets", "place_strips"]
@@ -110,7 +109,7 @@ class _Net:
         masks = [frame.mask for frame in frames]
         if not any(mask.roads.any() for mask in masks):
             return [], "no roads are seen"
-        mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks))
+        mosaic = lay_down(masks, self.matrices[list(chosen)], road_px(masks))
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
         options = tracker.look_options(mosaic, masks)
@@ -154,10 +153,6 @@ class _Net:
 
 #: A frame is where it was put, as against a block beside.
 _CHECK = CheckOptions(tolerance_m=20.0, max_sigma_m=10.0)
-
-
-def _road_px(masks: Sequence[RoadMask]) -> float:
-    return float(np.median([road_width(mask) for mask in masks if mask.roads.any()]))
 
 
 def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) -> list[Link]:

@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, Look
-from roadgeo.flights.mosaic import Mosaic, lay_together
+from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
 from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
@@ -30,9 +30,8 @@ from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
-from roadgeo.roads.vectorization import road_width
 
-__all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest", "track"]
+__all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest"]
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
@@ -252,7 +251,7 @@ class Tracker:
             self._forget()
         self._window = [*self._window, waiting][-self.options.most_frames :]
         masks = [member.frame.mask for member in self._window]
-        mosaic = lay_together(masks, [_motion(member) for member in self._window], _road_px(masks))
+        mosaic = lay_together(masks, [_motion(member) for member in self._window], road_px(masks))
         if mosaic is None:
             self._window = [waiting]
             self._forget()
@@ -348,13 +347,6 @@ class Tracker:
                     placed[k] = again
 
 
-def track(
-    frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
-) -> list[Tracked]:
-    """Follow a flight to its end; return the final state of each frame, in order."""
-    return latest(follow(frames, references, options))
-
-
 def latest(learnt: Iterable[tuple[FlightFrame, list[Tracked]]]) -> list[Tracked]:
     """Return the final state of each frame, in order."""
     known = {state.frame.number: state for _, news in learnt for state in news}
@@ -379,12 +371,6 @@ def _trace(mask: RoadMask) -> Scene | None:
 
 def _motion(waiting: _Waiting) -> FloatArray:
     return np.eye(3) if waiting.frame.motion is None else waiting.frame.motion
-
-
-def _road_px(masks: Sequence[RoadMask]) -> float:
-    """Return the usual width of a road in frames, pixels."""
-    shown = [road_width(mask) for mask in masks if mask.roads.any()]
-    return float(np.median(shown)) if shown else 1.0
 
 
 def _read(mosaic: Mosaic) -> Query | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
 
-__all__ = ["Homography", "map_each"]
+__all__ = ["Homography", "map_each", "shift"]
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,11 @@ class Homography:
         """Return the same map scaled so that the last element is 1 (where it is not 0), for writing down."""
         last = self.matrix[2, 2]
         return Homography(self.matrix / last) if last != 0 else self
+
+
+def shift(x: float, y: float) -> FloatArray:
+    """Return the (3, 3) matrix that moves points by x and y."""
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
 def map_each(matrices: FloatArray, xy: FloatArray) -> FloatArray:

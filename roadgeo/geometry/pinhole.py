@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 
 __all__ = ["View", "make_view", "sees_ground", "warp_mask"]
 
@@ -110,8 +110,7 @@ def warp_mask(
     height, width = mask.shape[:2]
     view = make_view((width / 2, -height / 2), (width, height), 1.0, tilt_deg, tilt_azimuth_deg, heading_deg)
     matrix = np.diag([1.0, -1.0, 1.0]) @ view.homography.matrix
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
-    source = np.linalg.inv(half) @ matrix @ half
+    source = shift(-0.5, -0.5) @ matrix @ shift(0.5, 0.5)  # OpenCV counts from pixel centres
     warped = cv2.warpPerspective(mask, source, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return np.where(warped > 127, 255, 0).astype(np.uint8), matrix
 
@@ -138,5 +137,4 @@ def _camera_homography(
     camera = -axis * focal * gsd_m
     ground = np.array([camera[2] * rays[0] - camera[0] * rays[2], camera[2] * rays[1] - camera[1] * rays[2], -rays[2]])
     ground /= focal * np.cos(tilt)
-    shift = np.array([[1.0, 0.0, center[0]], [0.0, 1.0, center[1]], [0.0, 0.0, 1.0]])
-    return Homography(shift @ ground)
+    return Homography(shift(*center) @ ground)

@@ -25,7 +25,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.whitening import whitener
 
 #: Focal lengths that an adjustment may start from, in usual ones.
@@ -114,7 +114,7 @@ def find_pose(
     if not np.isfinite(corners).all():
         return None
     origin = np.append(corners.mean(axis=0), 0.0)  # eastings and northings are large numbers
-    homography, corners = _moved_to(origin, homography), corners - origin[:2]
+    homography, corners = shift(-origin[0], -origin[1]) @ homography, corners - origin[:2]
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
     prior = math.log(options.focal_px or usual), 1e-6 if options.focal_px else options.usual_sigma
@@ -199,11 +199,6 @@ def pinhole_residuals(p: FloatArray, seen: SeenCorners) -> FloatArray:
     prior = (p[..., 6:] - seen.log_focal) / seen.log_focal_sigma
     below = np.asarray((rays[..., 2] < 0.0).all(axis=-1))[..., None]
     return np.asarray(np.where(below, np.concatenate((whitened, prior), axis=-1), np.inf))
-
-
-def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
-    """Return a homography to coordinates that count from an origin."""
-    return np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]]) @ homography
 
 
 def _starts(homography: FloatArray, frame: Frame, focals: FloatArray, log_focal: float) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError
+from roadgeo.geometry.homography import shift
 from roadgeo.geometry.transformation import exactness
 from roadgeo.storage.crs import known_crs
 
@@ -74,7 +75,7 @@ class LocalPlane:
 
     def to_crs_matrix(self) -> FloatArray:
         """(3, 3) homography from the plane to the CRS."""
-        return np.array([[1.0, 0.0, self.origin[0]], [0.0, 1.0, self.origin[1]], [0.0, 0.0, 1.0]])
+        return shift(*self.origin)
 
 
 def choose_plane(lonlat: FloatArray, own_crs: str | None = None) -> LocalPlane:

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 
 __all__ = ["MapGrid", "Transform", "choose_grid", "cover", "source_pixels", "warp"]
@@ -112,15 +112,14 @@ def warp(
         Behind it the image is a pinhole's, which the homography describes.
     """
     drawn = np.zeros((grid.height, grid.width, *image.shape[2:]), image.dtype)
-    to_corner, to_center = np.eye(3), np.eye(3)  # OpenCV counts from the centre of the first pixel
-    to_corner[:2, 2], to_center[:2, 2] = 0.5, -0.5
-    crs_to_pixel = np.linalg.inv(pixel_to_crs)
+    # OpenCV counts from the centre of the first pixel.
+    to_corner, crs_to_center = shift(0.5, 0.5), shift(-0.5, -0.5) @ np.linalg.inv(pixel_to_crs)
     for row in range(0, grid.height, BLOCK):
         for column in range(0, grid.width, BLOCK):
             block = drawn[row : row + BLOCK, column : column + BLOCK]
             size = block.shape[1::-1]
             if to_place is None and lens is None:
-                source = to_center @ crs_to_pixel @ grid.to_crs_matrix(column, row) @ to_corner
+                source = crs_to_center @ grid.to_crs_matrix(column, row) @ to_corner
                 cv2.warpPerspective(image, source, size, block, flags=interpolation | cv2.WARP_INVERSE_MAP)
             else:
                 picture = image.shape[1], image.shape[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.crs import name_crs
 from roadgeo.storage.geopackage import open_read_only, require_tables
 
-__all__ = ["check_reference", "describe_reference", "reference_digest"]
+__all__ = ["check_reference", "describe_reference"]
 
 
 def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -64,20 +63,6 @@ def check_reference(path: str | os.PathLike[str]) -> list[str]:
         return [problem for entry in read_shards(shards).files for problem in _check_shard(shards, entry)]
     except IndexFormatError as error:
         return [str(error)]
-
-
-def reference_digest(path: str | os.PathLike[str]) -> str:
-    """Return the digest of the intersections of a reference, of all its shards; "" where there is no index.
-
-    Raises
-    ------
-    IndexFormatError
-        The index or the manifest is damaged.
-    """
-    shards = _shards(path)
-    if shards is None:
-        return files.reference_digest(path)
-    return blake2b("".join(entry.digest for entry in read_shards(shards).files).encode(), digest_size=16).hexdigest()
 
 
 def _shards(path: str | os.PathLike[str]) -> Path | None:

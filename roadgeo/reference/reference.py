@@ -29,6 +29,7 @@ __all__ = [
     "AnyReference",
     "BuildOptions",
     "Reference",
+    "digest_of",
     "open_reference",
     "open_whole",
     "rebuild_reference",
@@ -50,10 +51,14 @@ COARSE = BuildOptions(simplify=SimplifyOptions().times(COARSENESS))
 
 @dataclass(frozen=True)
 class Reference:
-    """A searchable road map: its index, and the network it was built from where that is at hand."""
+    """A searchable road map: its index, and the network it was built from where that is at hand.
+
+    `digest` is that of its intersections, where it was opened from a file.
+    """
 
     index: ReferenceIndex
     network: RoadNetwork | None = None
+    digest: str = ""
 
     def __repr__(self) -> str:
         """Describe the reference in one line."""
@@ -106,6 +111,12 @@ class Reference:
 
 #: One piece, or shards.
 AnyReference: TypeAlias = "Reference | ShardedReference"
+
+
+def digest_of(references: Sequence[AnyReference], name: str) -> str:
+    """Return the digest of the reference of that name; of all where none has it, for they were searched in vain."""
+    here = [reference for reference in references if reference.name == name][:1] or references
+    return ", ".join(reference.digest for reference in here if reference.digest)
 
 
 def swapped_near(
@@ -183,12 +194,12 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
 def open_whole(path: str | Path, say: Say = say_nothing) -> Reference:
     """Open a reference of one piece (see `open_reference`)."""
     from roadgeo.reference.files import open_reference as open_parts
-    from roadgeo.reference.files import reference_paths
+    from roadgeo.reference.files import reference_digest, reference_paths
 
     meta, arrays = open_parts(path, _index_builder(path, say))
     index = ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage))
     let_pages_go(arrays.values())
-    return Reference(index)
+    return Reference(index, digest=reference_digest(path))
 
 
 def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:

@@ -29,7 +29,7 @@ class ShardBox:
     core: Bounds
 
 
-def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float, least_cells: int = 1) -> list[ShardBox]:
+def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float) -> list[ShardBox]:
     """Cut the ground into boxes with at most about `most` segments each; one without roads is left out.
 
     Parameters
@@ -40,27 +40,25 @@ def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float, least_
         Side of a cell, units of the CRS.
     most : float
         Segments in a box, unless it is a single cell.
-    least_cells : int
-        Least width of a box, in cells.
     """
     cells = np.array(sorted(n_segments), np.int64).reshape(-1, 2)
     counts = np.array([n_segments[x, y] for x, y in cells.tolist()], np.int64)
-    boxes = _cut(cells, counts, _bounding(cells), most, least_cells) if len(cells) else []
+    boxes = _cut(cells, counts, _bounding(cells), most) if len(cells) else []
     return [
         ShardBox(f"{x0}_{y0}_{x1 - x0}x{y1 - y0}", (x0 * size, y0 * size, x1 * size, y1 * size))
         for x0, y0, x1, y1 in boxes
     ]
 
 
-def _cut(cells: IntArray, counts: IntArray, box: _Box, most: float, least_cells: int) -> list[_Box]:
+def _cut(cells: IntArray, counts: IntArray, box: _Box, most: float) -> list[_Box]:
     """Halve a box along its longer side until no part holds more than `most`; together the parts cover all of it."""
     axis = 0 if box[2] - box[0] >= box[3] - box[1] else 1
     start, end = box[axis], box[axis + 2]
-    if counts.sum() <= most or end - start < 2 * least_cells:
+    if counts.sum() <= most or end - start < 2:
         return [box] if counts.sum() else []
     order = np.argsort(cells[:, axis], kind="stable")
     half = int(np.searchsorted(np.cumsum(counts[order]), counts.sum() / 2.0))
-    at = min(max(int(cells[order[min(half, len(order) - 1)], axis]), start + least_cells), end - least_cells)
+    at = min(max(int(cells[order[min(half, len(order) - 1)], axis]), start + 1), end - 1)
     low = cells[:, axis] < at
     x0, y0, x1, y1 = box
     sides: tuple[_Box, _Box] = ((x0, y0, at, y1), (at, y0, x1, y1))
@@ -69,7 +67,7 @@ def _cut(cells: IntArray, counts: IntArray, box: _Box, most: float, least_cells:
     return [
         part
         for side, inside in zip(sides, (low, ~low), strict=True)
-        for part in _cut(cells[inside], counts[inside], side, most, least_cells)
+        for part in _cut(cells[inside], counts[inside], side, most)
     ]
 
 

@@ -20,6 +20,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from roadgeo.geometry.areas import Box, overlap
 from roadgeo.location import Location
 from roadgeo.matching.index import COARSENESS, ReferenceIndex
 from roadgeo.matching.parts import Near, touches
-from roadgeo.reference.files import identities, reference_digest, reference_paths
+from roadgeo.reference.files import identities, reference_paths
 from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
@@ -267,14 +268,13 @@ class Shard:
 
         for _ in range(2):  # an index that is missing is built by opening it
             before = identities(self.path)
-            index = open_whole(self.path).index
-            digest = reference_digest(self.path) or stored_digest(reference_paths(self.path).geopackage)
-            if digest != self.entry.digest:
+            opened = open_whole(self.path)
+            if (opened.digest or stored_digest(reference_paths(self.path).geopackage)) != self.entry.digest:
                 raise IndexFormatError(
                     f"{self.path}: is not the shard that the manifest names; build the reference again"
                 )
             if identities(self.path) == before:
-                return index
+                return opened.index
         raise IndexFormatError(f"{self.path}: is replaced again and again; try when that is done")
 
 
@@ -296,6 +296,12 @@ class ShardedReference:
     def name(self) -> str:
         """Its name for the user."""
         return self.manifest.name
+
+    @property
+    def digest(self) -> str:
+        """Digest of the intersections of all its shards."""
+        digests = "".join(entry.digest for entry in self.manifest.files)
+        return blake2b(digests.encode(), digest_size=16).hexdigest()
 
     def only(self, names: Collection[str]) -> ShardedReference:
         """Return the same map, of which only parts of these names are searched."""

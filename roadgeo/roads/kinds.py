@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cache
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -87,15 +88,14 @@ def in_tunnel(values: AnyArray) -> BoolArray:
 
 def _each(values: AnyArray, test: Any) -> BoolArray:
     """Apply a test of a set of names to every value; equal values are tested once."""
-    verdicts: dict[Any, bool] = {}
-    result = np.empty(len(values), bool)
-    for i, value in enumerate(values):
-        item = value.item() if isinstance(value, np.generic) else value
-        key = tuple(map(str, item)) if isinstance(item, Iterable) and not isinstance(item, str) else item
-        if key not in verdicts:
-            verdicts[key] = bool(test(_names(key)))
-        result[i] = verdicts[key]
-    return result
+    tested = cache(lambda key: test(_names(key)))
+    return np.array([tested(_key(value)) for value in values], bool)
+
+
+def _key(value: Any) -> Any:
+    """Return a value, of several a tuple of texts, as something that can be looked up."""
+    item = value.item() if isinstance(value, np.generic) else value
+    return tuple(map(str, item)) if isinstance(item, Iterable) and not isinstance(item, str) else item
 
 
 def _names(value: Any) -> set[str]:

@@ -175,14 +175,9 @@ class Locating:
 
     def ask(self) -> Asked:
         """Open the references, and collect the question that every mask is asked."""
-        from roadgeo.reference.inspection import reference_digest
-        from roadgeo.reference.reference import open_reference
-
         started = perf_counter()
-        paths = _resolve(self.references)
-        references = [open_reference(path) for path in paths]
-        digests = [(reference.name, reference_digest(path)) for reference, path in zip(references, paths, strict=True)]
-        return Asked(references, digests, perf_counter() - started, self._changes())
+        references = open_references(self.references)
+        return Asked(references, perf_counter() - started, self._changes())
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
@@ -272,6 +267,7 @@ class Locating:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
+        from roadgeo.reference.reference import digest_of
         from roadgeo.running.queries import locate_query
         from roadgeo.workflows import explain, locate
 
@@ -291,7 +287,7 @@ class Locating:
             options=asked.options,
             command=self._command(task),
             stated_offset_m=_off_stated(task.mask, location),
-            reference_digest=asked.digest(location.reference),
+            reference_digest=digest_of(asked.references, location.reference),
         )
         paths, photo = output_paths(self.out_dir, task.stem), self.options.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
@@ -329,22 +325,16 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 
 @dataclass(frozen=True)
 class Asked:
-    """The question that every mask of a batch is asked: references, their digests by name, options."""
+    """The question that every mask of a batch is asked: references and options; `seconds` were spent to open them."""
 
     references: list[AnyReference]
-    digests: list[tuple[str, str]]
     seconds: float
     options: dict[str, Any]
-
-    def digest(self, names: str) -> str:
-        """Return the digest of the reference of that name; of all where several were searched in vain."""
-        found = [digest for name, digest in self.digests if name == names]
-        return ", ".join(found[:1] or [digest for _, digest in self.digests])
 
     def same(self, document: Mapping[str, Any]) -> bool:
         """Whether an earlier result answers the same question; without a question in it, it does."""
         options, digest = document.get("options"), document.get("reference_digest")
-        same_maps = digest is None or set(digest.split(", ")) <= {each for _, each in self.digests}
+        same_maps = digest is None or set(digest.split(", ")) <= {reference.digest for reference in self.references}
         return same_maps and (options is None or options == self.options)
 
 

@@ -39,7 +39,7 @@ from roadgeo.reference.spool import Bounds, Spool
 from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.network import build_network
 from roadgeo.running.processes import run
-from roadgeo.sources.lines import RoadLines
+from roadgeo.sources.lines import RoadLines, add_counts
 from roadgeo.sources.overpass import box_area
 from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, with_crs
 from roadgeo.sources.streams import list_sources, stream_lines, tell_source
@@ -222,7 +222,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
         say(what)
         for part in stream_lines(file, roads.layer, advance=lambda share, what=what: say(what, share)):  # type: ignore[misc]
             chosen = choose_lines(with_crs(part, roads.crs, file), file.name, roads.which, roads.tunnels, area)
-            _add_up(counts, chosen.meta)
+            add_counts(counts, chosen.meta)
             crs = crs or chosen.crs
             if spool is None:
                 spool = Spool(folder, (options.size_m or _CELL_M) / (_metres(str(crs)) or _DEGREE_M))
@@ -241,13 +241,6 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
         "attribution": "; ".join(calls) if roads.attribution is None else roads.attribution,
     }
     return None if spool is None else _Spooled(str(crs), spool.size, dict(spool.n_segments), meta)
-
-
-def _add_up(counts: dict[str, Any], part: dict[str, Any]) -> None:
-    """Add the counts of a part of a source to its totals."""
-    for key, value in part.items():
-        is_count = type(value) is int
-        counts[key] = counts.get(key, 0) + value if is_count else value
 
 
 def _to(lines: RoadLines, crs: str) -> Any:

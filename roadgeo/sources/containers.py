@@ -19,7 +19,6 @@ from roadgeo.errors import NoRoadsError, RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through, objects
 from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_ways
 from roadgeo.sources.schemas import is_known_column, names_kinds
-from roadgeo.storage.crs import crs_name
 from roadgeo.storage.crs_guard import refuse_named_files
 from roadgeo.storage.unpacking import require_bounded
 from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
@@ -106,7 +105,7 @@ def _stream_gdal(
             shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
             meta = {"format": found.driver, "layer": ", ".join(layers), **found.notes}
             meta |= {"part": part} if part else {}
-            yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
+            yield RoadTable(shapes, found.crs, found.columns, meta)
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(layers))
 
 
@@ -206,7 +205,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
 
 
-def _geometry_of(file: Any) -> tuple[str, str | None, str]:
+def _geometry_of(file: Any) -> tuple[str, Any, str]:
     """Return the geometry column of a Parquet file, its CRS and its encoding."""
     import pyarrow as pa
 
@@ -214,7 +213,7 @@ def _geometry_of(file: Any) -> tuple[str, str | None, str]:
     if b"geo" in stored:
         geo = json.loads(stored[b"geo"])
         column = geo["columns"][geo["primary_column"]]
-        return geo["primary_column"], crs_name(column.get("crs", "EPSG:4326")), str(column.get("encoding"))
+        return geo["primary_column"], column.get("crs", "EPSG:4326"), str(column.get("encoding"))
     schema = file.schema_arrow
     for name in sorted(schema.names, key=lambda name: (name.lower() not in _SHAPES, name)):
         kind = schema.field(name).type
@@ -303,7 +302,7 @@ def held_table(roads: Any) -> RoadTable:
         shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
     except (TypeError, ValueError) as error:
         raise RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {error}; {_EXPECTED}") from error
-    return RoadTable(objects(shapes), crs_name(getattr(roads, "crs", None)))
+    return RoadTable(objects(shapes), getattr(roads, "crs", None))
 
 
 def _held_columns(roads: Any) -> RoadTable | None:
@@ -317,7 +316,7 @@ def _held_columns(roads: Any) -> RoadTable | None:
     if name is None:
         return None
     shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
-    return RoadTable(shapes, crs_name(getattr(roads, "crs", None)), columns)
+    return RoadTable(shapes, getattr(roads, "crs", None), columns)
 
 
 def _line(coordinates: Any) -> Any:
@@ -352,7 +351,7 @@ def _graph_table(graph: Any) -> RoadTable:
             shape = shapely.LineString(ends)
         shapes.append(shape)
         rows.append(data)
-    return RoadTable(objects(shapes), crs_name(graph.graph.get("crs")), _columns(rows))
+    return RoadTable(objects(shapes), graph.graph.get("crs"), _columns(rows))
 
 
 def _columns(rows: Sequence[Mapping[Any, Any]]) -> dict[str, AnyArray]:

@@ -17,6 +17,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo._text import visible
 from roadgeo.errors import MaskError, RoadSourceError
+from roadgeo.geometry.homography import shift
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import choose_plane, from_lonlat
 from roadgeo.storage.crs import known_crs
@@ -97,9 +98,8 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
     if not 0 < side < 1e9:
         raise MaskError(f"{name}: its lines cover {side:g} units; expected a frame of roads")
     unit = max(side / _MOST_PX, 1.0) if kind == "pixels" else float(np.clip(1.0, side / _MOST_PX, side / _LEAST_PX))
-    top = low[1] if downwards else -high[1]
-    shift = np.array([[1.0, 0.0, _MARGIN_PX - low[0] / unit], [0.0, 1.0, _MARGIN_PX - top / unit], [0.0, 0.0, 1.0]])
-    to_pixel = shift @ np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ flip
+    corner = _MARGIN_PX - np.array([low[0], low[1] if downwards else -high[1]]) / unit
+    to_pixel = shift(*corner) @ np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ flip
     width, height = np.ceil((high - low) / unit).astype(int) + 2 * _MARGIN_PX
     road = _ROAD_PX if kind == "pixels" else float(np.clip(_ROAD_M / unit, 4.0, 12.0))
     shapes = shapely.transform(shapes, lambda xy: xy @ to_pixel[:2, :2].T + to_pixel[:2, 2])

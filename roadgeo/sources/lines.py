@@ -11,7 +11,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 __all__ = [
-    *("OSM_ATTRIBUTION", "RoadLines", "RoadTable", "cut_lines", "join_lines", "line_through", "objects"),
+    *("OSM_ATTRIBUTION", "RoadLines", "RoadTable", "add_counts", "cut_lines", "join_lines", "line_through", "objects"),
     *("simple_areas", "simple_lines"),
 ]
 
@@ -26,8 +26,8 @@ class RoadTable:
     ----------
     shapes : (N,) object
         Shapely geometries of any type, or None.
-    crs : str or None
-        "EPSG:n" or WKT; None where the container has none.
+    crs : anything that pyproj knows, or None
+        As the container gives it; None where it gives none.
     columns : dict
         (N,) object each, by name.
     meta : dict
@@ -35,7 +35,7 @@ class RoadTable:
     """
 
     shapes: AnyArray
-    crs: str | None
+    crs: Any
     columns: dict[str, AnyArray] = field(default_factory=dict)
     meta: dict[str, Any] = field(default_factory=dict)
 
@@ -85,7 +85,7 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
         return first
     meta: dict[str, Any] = {}
     for part in parts:
-        meta |= {key: meta.get(key, 0) + value if type(value) is int else value for key, value in part.meta.items()}
+        add_counts(meta, part.meta)
 
     def column(name: str) -> AnyArray | None:
         if all(getattr(part, name) is None for part in parts):
@@ -96,6 +96,11 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
 
     lines, areas = (np.concatenate([getattr(part, name) for part in parts]) for name in ("lines", "areas"))
     return RoadLines(lines, first.crs, column("highway"), column("tunnel"), meta, column("name"), areas)
+
+
+def add_counts(meta: dict[str, Any], part: dict[str, Any]) -> None:
+    """Add the counts of a part of a source to its totals, and take over whatever else is known of it."""
+    meta |= {key: meta.get(key, 0) + value if type(value) is int else value for key, value in part.items()}
 
 
 def line_through(points: FloatArray) -> Any:

@@ -44,6 +44,9 @@ _MOST_LISTED = 8
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
 
+#: Values of rows (rows, columns, B), and where they are valid; None for everywhere.
+_Rows = tuple[AnyArray, BoolArray | None]
+
 
 def read_mask(
     source: str | os.PathLike[str] | AnyArray,
@@ -192,7 +195,7 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
     """
     share = len(seen) / (len(seen) + len(hidden))
     if raster.has_alpha and 0 < share <= _MAX_ROAD_SHARE and not seen.any():
-        return replace(raster, read=_where(raster, True), bands=raster.bands[:1])
+        return replace(_where(raster, True), bands=raster.bands[:1])
     middle, valid = _middle(raster)
     shown = ~_finite(middle, valid)
     edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
@@ -200,21 +203,22 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
         return raster
     if (seen == seen[0]).all():
         _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", visible(raster.name))
-        return replace(raster, read=_where(raster, False), bands=raster.bands[:1])
+        return replace(_where(raster, False), bands=raster.bands[:1])
     is_lightest = seen.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > seen.max()
     if not is_lightest or len(np.unique(seen)) <= 2:
         return raster
     _LOG.warning("%s: its lightest pixels are nodata: they are taken for roads, too", visible(raster.name))
-    return replace(raster, read=lambda *rows: (raster.read(*rows)[0], None))
+    return _changed(raster, lambda values, _: (values, None))
 
 
-def _where(raster: Raster, observed: bool) -> Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]:
-    """Return what reads as roads the pixels of a raster that were observed, or those that were not."""
+def _changed(raster: Raster, change: Callable[[AnyArray, BoolArray | None], _Rows]) -> Raster:
+    """Return a raster whose rows are changed as they are read."""
+    return replace(raster, read=lambda *rows: change(*raster.read(*rows)))
 
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        return (_finite(*raster.read(top, bottom, step)) == observed).view(np.uint8)[..., None], None
 
-    return read
+def _where(raster: Raster, observed: bool) -> Raster:
+    """Take the pixels of a raster that were observed for roads, or those that were not."""
+    return _changed(raster, lambda *read: ((_finite(*read) == observed).view(np.uint8)[..., None], None))
 
 
 def _of_class(raster: Raster, number: int) -> Raster:
@@ -231,12 +235,7 @@ def _of_class(raster: Raster, number: int) -> Raster:
     if number not in classes:
         listed = ", ".join(f"{value:g}" for value in classes[:_MOST_LISTED])
         raise MaskError(f"{raster.name}: holds no value {number}, but {listed}; give the one that is road with --class")
-
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        values, valid = raster.read(top, bottom, step)
-        return (values == number).view(np.uint8), _finite(values, valid)
-
-    return replace(raster, read=read)
+    return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
 
 
 def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]:
@@ -247,12 +246,11 @@ def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]
     if unlabelled is None:
         return raster, sample
 
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        values, valid = raster.read(top, bottom, step)
+    def leave_out(values: AnyArray, valid: BoolArray | None) -> _Rows:
         labelled = values[..., sample.channel] != unlabelled
         return values, labelled if valid is None else labelled & valid
 
-    labelled = replace(raster, read=read)
+    labelled = _changed(raster, leave_out)
     seen = sample.seen[sample.seen[:, sample.channel] != unlabelled]
     return labelled, replace(sample, seen=seen, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
 
@@ -320,11 +318,6 @@ def _strips(raster: Raster, step: int) -> Iterator[slice]:
         yield slice(top, min(top + rows, height))
 
 
-def _observed(values: AnyArray, valid: BoolArray | None) -> AnyArray:
-    """Return (n, B) values of pixels that are valid numbers."""
-    return np.asarray(values[_finite(values, valid)])
-
-
 def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
     """Return (rows, columns) where values are valid numbers."""
     finite = np.ones(values.shape[:2], np.bool_) if valid is None else valid
@@ -375,7 +368,7 @@ def _require_mask(raster: Raster) -> None:
     if max(raster.shape) <= MAX_SIDE and raster.n_unread == 0:
         return
     values, valid = _middle(raster)
-    seen = _observed(values, valid)
+    seen = values[_finite(values, valid)]
     many = f"{raster.name}: has {len(raster.all_bands)} bands; choose the one that holds the roads"
     try:
         if len(seen):

@@ -79,7 +79,6 @@ def choose_roads(
     which: RoadKind = "drivable",
     tunnels: bool = False,
     attribution: str | None = None,
-    say: Say = say_nothing,
     crs: Any = None,
 ) -> Roads:
     """Return the roads to build a reference from, of files or of whatever a program holds; `Roads` as they are.
@@ -105,7 +104,7 @@ def choose_roads(
     listed = roads if isinstance(roads, list | tuple) else [roads]
     if listed and all(isinstance(one, paths) for one in listed):
         given = None if crs is None else name_crs(crs)
-        return read_roads(listed, crs=given, which=which, tunnels=tunnels, attribution=attribution, say=say)
+        return read_roads(listed, crs=given, which=which, tunnels=tunnels, attribution=attribution)
     table = held_table(roads)
     lines = recognise(table).adapt(table)
     lines = with_crs(lines, crs, name)

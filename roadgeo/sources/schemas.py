@@ -23,6 +23,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.roads.kinds import KNOWN_HIGHWAYS, NO_ROADS, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, objects, simple_areas, simple_lines
+from roadgeo.storage.crs import crs_name
 
 __all__ = ["Schema", "is_known_column", "names_kinds", "recognise"]
 
@@ -105,7 +106,7 @@ class Schema:
         told = {"attribution": self.attribution, **table.meta, **counts}
         return RoadLines(
             lines,
-            table.crs,
+            crs_name(table.crs),
             kinds[row] if self.kinds else None,
             np.logical_or.reduce(tunnels) if tunnels else None,
             {"features": len(table.shapes)} | {key: value for key, value in told.items() if value},

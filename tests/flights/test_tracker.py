@@ -12,7 +12,7 @@ from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import fix_of
 from roadgeo.flights.pose import start
 from roadgeo.flights.rows import make_rows
-from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, track
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, follow, latest
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
 
@@ -39,7 +39,7 @@ def error(flown, one):
 
 def test_all_frames_are_placed_to_metres_those_that_waited_too(flight):
     flown, frames, reference = flight
-    tracked = track(frames, [reference])
+    tracked = latest(follow(frames, [reference]))
     assert [one.frame.number for one in tracked] == list(range(9))
     assert {one.status for one in tracked} <= {"located", "tracked", "predicted"}
     assert max(error(flown, one) for one in tracked) < 5.0
@@ -69,7 +69,7 @@ def test_a_frame_without_roads_is_followed_by_its_motion(flight):
     flown, frames, reference = flight
     blank = RoadMask(np.zeros((300, 400), bool))
     frames = [*frames[:7], FlightFrame(7, "7", 7.0, blank, frames[7].motion), frames[8]]
-    tracked = track(frames, [reference])
+    tracked = latest(follow(frames, [reference]))
     assert tracked[7].status == "predicted"
     assert error(flown, tracked[7]) < 10.0
     assert tracked[8].status == "tracked"
@@ -133,7 +133,7 @@ def test_a_frame_that_the_mosaic_bends_away_is_placed_from_its_neighbour(flight,
         return settle(self, location, replace(mosaic, to_mosaic=[away @ mosaic.to_mosaic[0], *mosaic.to_mosaic[1:]]))
 
     monkeypatch.setattr(Tracker, "_settle", bent)
-    tracked = track(frames, [reference])
+    tracked = latest(follow(frames, [reference]))
     assert tracked[0].status == "located"
     assert error(flown, tracked[0]) < 3.0 * tracked[0].pose.sigma_m < 10.0
 
@@ -144,7 +144,7 @@ def test_frames_without_motion_stay_where_the_mosaic_puts_them(flight, monkeypat
     given = []
     settle = Tracker._settle
     monkeypatch.setattr(Tracker, "_settle", lambda self, *found: given.append(found) or settle(self, *found))
-    known = track(frames, [reference])
+    known = latest(follow(frames, [reference]))
     n = sum(one.status == "located" for one in known)
     monkeypatch.setattr("roadgeo.flights.tracker.predict", lambda *_: pytest.fail("moved without a motion"))
     placed = Tracker([reference]).place(*given[-1], [replace(frame, motion=None) for frame in frames[:n]])

@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 
 import roadgeo
+from roadgeo.api import build_reference
 from roadgeo.reference.network_file import _texts, read_network
 from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 AT = 100.0 * np.arange(6)
 STREETS = [[(x, 0), (x, 500)] for x in AT] + [[(0, y), (500, y)] for y in AT]

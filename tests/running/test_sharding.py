@@ -10,6 +10,7 @@ import shapely
 from worlds.fenway import write_vector
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, scene_of
 
+from roadgeo.api import build_reference
 from roadgeo.cli import main
 from roadgeo.errors import CrsError, IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import transformer
@@ -26,7 +27,6 @@ from roadgeo.reference.shards import write_manifest
 from roadgeo.roads.network import build_network
 from roadgeo.running import sharding
 from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
-from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.slow
 

@@ -9,10 +9,10 @@ import shapely
 from worlds.fenway import streets
 
 import roadgeo
+from roadgeo.api import build_reference
 from roadgeo.cli import main
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.reference.reference import open_reference
-from roadgeo.workflows import build_reference
 
 
 @pytest.fixture(scope="module")

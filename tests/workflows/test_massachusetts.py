@@ -9,12 +9,13 @@ import numpy as np
 import pyproj
 import pytest
 
+from roadgeo.api import build_reference
 from roadgeo.evaluation.truth import Truth, read_truth
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pinhole import warp_mask
 from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
-from roadgeo.workflows import build_reference, locate
+from roadgeo.workflows import locate
 
 pytestmark = pytest.mark.realdata
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from roadgeo.api import build_reference
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
-from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.realdata
 
