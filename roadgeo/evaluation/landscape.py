@@ -55,11 +55,9 @@ class Landscape:
         return np.array([self.graph.coords.min(axis=0), self.graph.coords.max(axis=0)])
 
     @cached_property
-    def edge_boxes(self) -> FloatArray:
-        """(E, 4) west, south, east, north of every edge."""
-        starts = self.graph.offsets[:-1]
-        coords = self.graph.coords
-        return np.hstack([np.minimum.reduceat(coords, starts), np.maximum.reduceat(coords, starts)])
+    def lines(self) -> AnyArray:
+        """(E,) shapely LineString of every edge."""
+        return self.graph.lines()
 
     def covers(self, points: FloatArray) -> bool:
         """Whether all (K, 2) points lie on ground whose roads are known."""
@@ -103,10 +101,13 @@ def visible_strokes(landscape: Landscape, view: View, rng: np.random.Generator) 
     """Sample the roads around the footprint every few pixels and see them through the camera."""
     low, high = view.footprint.min(axis=0), view.footprint.max(axis=0)
     pad = PAD_PX * float(view.sampling(view.corners).max())
-    boxes = landscape.edge_boxes
+    boxes = shapely.bounds(landscape.lines)
     near = np.flatnonzero(((boxes[:, :2] <= high + pad) & (boxes[:, 2:] >= low - pad)).all(axis=1))
     step = 8.0 * float(view.sampling(view.corners).min())
-    points, street, along = _sample_edges(landscape.graph, near, step)
+    points, owner = shapely.get_coordinates(shapely.segmentize(landscape.lines[near], step), return_index=True)
+    street, steps = near[owner], np.hypot(*np.diff(points, axis=0).T)
+    steps[owner[1:] != owner[:-1]] = 0.0  # the jump from one edge to the next is no road
+    along = np.cumsum(np.append(0.0, steps))[: len(points)]
 
     pixels = view.homography.inverse()(points)
     frame = np.array(view.size_px)
@@ -119,34 +120,6 @@ def visible_strokes(landscape: Landscape, view: View, rng: np.random.Generator) 
     piece = np.concatenate(([0], np.cumsum(changes)))[: len(along)]
     start, end = pixels[drawn], pixels[drawn + 1]
     return Strokes(start, end, np.hypot(*(end - start).T), street[drawn], piece[drawn])
-
-
-def _sample_edges(graph: RoadGraph, edges: IntArray, step: float) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Sample edges at their vertices and at least every `step` between them.
-
-    Returns
-    -------
-    points : (P, 2) float64
-    edge : (P,) int64
-    along : (P,) float64
-        Distance from the first sample along all edges, one after another.
-    """
-    sizes = (graph.offsets[1:] - graph.offsets[:-1])[edges]
-    if len(edges) == 0:
-        return np.empty((0, 2)), np.empty(0, np.int64), np.empty(0)
-    packed = np.cumsum(sizes) - sizes  # where each edge starts once they are taken one after another
-    vertex = np.repeat(graph.offsets[edges] - packed, sizes) + np.arange(sizes.sum())
-    coords, owner = graph.coords[vertex], np.repeat(edges, sizes)
-    steps = np.hypot(*np.diff(coords, axis=0).T)
-    steps[owner[1:] != owner[:-1]] = 0.0  # the jump from one edge to the next is no road
-    parts = np.concatenate((np.maximum(np.ceil(steps / step), 1).astype(np.int64), [1]))
-    index = np.repeat(np.arange(len(coords)), parts)
-    share = (np.arange(len(index)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[index]
-    ahead = np.minimum(index + 1, len(coords) - 1)
-    share[owner[ahead] != owner[index]] = 0.0
-    points = coords[index] + share[:, None] * (coords[ahead] - coords[index])
-    along = np.concatenate(([0.0], np.cumsum(steps)))[index] + share * np.concatenate((steps, [0.0]))[index]
-    return points, owner[index], along
 
 
 def visible_intersections(landscape: Landscape, view: View, margin_px: float = 15.0) -> FloatArray:

@@ -37,7 +37,7 @@ def coverage(graph: RoadGraph, cell_m: float = 150.0, gap_m: float = 600.0) -> l
 
     if graph.n_edges == 0:
         return []
-    lines = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
+    lines = graph.lines()
     stripes = _stripes(shapely.get_coordinates(shapely.segmentize(lines, cell_m / 2)), cell_m)
     half = gap_m / 2
     left, bottom, right, top = stripes.T

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, Int32Array, IntArray
+from roadgeo._arrays import AnyArray, FloatArray, Int32Array, IntArray
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -71,6 +71,13 @@ class RoadGraph:
         """Vertices of every edge, views."""
         return [self.polyline(e) for e in range(self.n_edges)]
 
+    def lines(self) -> AnyArray:
+        """(E,) shapely LineString of every edge."""
+        import shapely
+
+        owner = np.repeat(np.arange(self.n_edges), np.diff(self.offsets))
+        return np.asarray(shapely.linestrings(self.coords, indices=owner))
+
     def to_networkx(self, move: Callable[[FloatArray], FloatArray] | None = None, **about: Any) -> nx.MultiGraph:
         """Return it as a networkx graph: nodes with `x` and `y`, edges with `geometry` (shapely) and `length`.
 
@@ -82,14 +89,12 @@ class RoadGraph:
             The graph's own attributes: `crs`, as in osmnx, for example.
         """
         import networkx as nx
-        import shapely
 
         move = move or (lambda xy: xy)
         graph = nx.MultiGraph(**about)
         xy = move(self.xy).reshape(-1, 2).tolist()
         graph.add_nodes_from((n, {"x": x, "y": y}) for n, (x, y) in enumerate(xy))
-        line_of = np.repeat(np.arange(self.n_edges), np.diff(self.offsets))
-        lines = shapely.linestrings(move(self.coords).reshape(-1, 2), indices=line_of)
+        lines = replace(self, coords=move(self.coords).reshape(-1, 2)).lines()
         ends = zip(self.edges.tolist(), lines, self.edge_lengths().tolist(), strict=True)
         graph.add_edges_from((a, b, {"geometry": line, "length": length}) for (a, b), line, length in ends)
         return graph

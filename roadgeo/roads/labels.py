@@ -42,8 +42,7 @@ def _nearest(graph: RoadGraph, lines: AnyArray) -> AnyArray:
     found = np.full(graph.n_edges, -1, np.int64)
     if graph.n_edges == 0 or len(lines) == 0:
         return found
-    roads = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
-    middles = shapely.line_interpolate_point(roads, 0.5, normalized=True)
+    middles = shapely.line_interpolate_point(graph.lines(), 0.5, normalized=True)
     edge, line = shapely.STRtree(lines).query_nearest(middles, max_distance=_REACH_M, all_matches=False)
     found[edge] = line
     return found
