@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.geometry.similarity import fit_similarity
 
 __all__ = ["Displacement", "measure"]
 
@@ -73,35 +74,16 @@ class Displacement:
 
 
 def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> Displacement:
-    """Fit the similarity that takes the corners (4, 2) of a frame from `start` to `end`.
-
-    By least squares weighted by the corners' errors: a corner that the roads hardly determine, such as the far one
-    of a frame with roads on one side only, hardly counts.
+    """Fit the similarity that takes the corners (4, 2) of a frame from `start` to `end` (see `fit_similarity`).
 
     Parameters
     ----------
     end_covariance : (8, 8)
         Covariance of x and y of the corners in turn, square metres; positive definite.
     """
-    about = start.mean(axis=0)
-    x, y = (start - about).T
-    # Displacements d = (east, north) + turn * (-y, x) + (scale - 1) * (x, y) are linear in a = s cos t, b = s sin t.
-    rows = np.zeros((4, 2, 4))
-    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
-    rows[:, 0, 2], rows[:, 1, 2] = -y, x
-    rows[:, 0, 3], rows[:, 1, 3] = x, y
-    design = rows.reshape(8, 4)
-    moved = (end - start).reshape(8)
-    weighted = np.linalg.solve(end_covariance, design).T
-    covariance = np.asarray(np.linalg.inv(weighted @ design))
-    east, north, b, a = covariance @ weighted @ moved
-    left = (moved - design @ (east, north, b, a)).reshape(4, 2)
-    return Displacement(
-        about,
-        float(east),
-        float(north),
-        -math.degrees(math.atan2(b, 1.0 + a)),
-        float(math.hypot(1.0 + a, b)),
-        covariance,
-        float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
-    )
+    (a, b, *middle), covariance, left = fit_similarity(start, end, end_covariance)
+    about, order = start.mean(axis=0), [2, 3, 1, 0]
+    east, north = (middle - about).tolist()
+    turn_deg, scale = -math.degrees(math.atan2(b, a)), math.hypot(a, b)
+    off = float(np.sqrt(np.mean(np.sum(left.reshape(4, 2) ** 2, axis=1))))
+    return Displacement(about, east, north, turn_deg, scale, covariance[np.ix_(order, order)], off)

@@ -16,7 +16,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.whitening import whitener
 
-__all__ = ["Similarity", "find_similarity"]
+__all__ = ["Similarity", "find_similarity", "fit_similarity"]
 
 #: 99 % of chi-squared with four degrees of freedom. Views straight down: 0.2 to 3.3; tilted by 0.1 to 2 degrees, of
 #: masks as a segmenter makes them: 24 and more.
@@ -53,20 +53,47 @@ def find_similarity(homography: FloatArray, corners: FloatArray, corner_covarian
     """
     if not np.isfinite(corner_covariance).all():
         return None
-    places, middle = Homography(homography).everywhere(corners), corners.mean(axis=0)
-    origin = places.mean(axis=0)
-    # X = a x - b y + X0, Y = b x + a y + Y0
-    (x, y), zero, ones = (corners - middle).T, np.zeros(4), np.ones(4)
-    design = np.stack([np.c_[x, -y, ones, zero], np.c_[y, x, zero, ones]], axis=1).reshape(8, 4)
-    weights, observed = whitener(corner_covariance), (places - origin).ravel()
-    covariance = np.linalg.inv((weights @ design).T @ (weights @ design))
-    parameters = covariance @ (weights @ design).T @ (weights @ observed)
-    set_aside = observed - design @ parameters
-    square = float(np.sum((weights @ set_aside) ** 2))
+    places = Homography(homography).everywhere(corners)
+    (a, b, *place), covariance, set_aside = fit_similarity(corners, places, corner_covariance)
+    square = float(np.sum((whitener(corner_covariance) @ set_aside) ** 2))
     if not square <= _MOST:
         return None
     less = 1.0 - math.exp(-square / 2.0) * (1.0 + square / 2.0)  # chi-squared with four degrees of freedom
-    a, b = parameters[:2]
     matrix = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 1.0]])
-    matrix[:2, 2] = origin + parameters[2:] - matrix[:2, :2] @ middle
+    middle, design = corners.mean(axis=0), _design(corners)
+    matrix[:2, 2] = place - matrix[:2, :2] @ middle
     return Similarity(matrix, np.asarray(design @ covariance @ design.T), less * np.outer(set_aside, set_aside))
+
+
+def fit_similarity(
+    points: FloatArray, places: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit the similarity that takes the corners (4, 2) of a frame to their places, by generalised least squares.
+
+    Corners that are hardly determined, such as the far ones of a frame with roads on one side only, hardly count.
+
+    Parameters
+    ----------
+    covariance : (8, 8) float64
+        Covariance of x and y of the places in turn; positive definite.
+
+    Returns
+    -------
+    parameters : (4,) float64
+        a, b, X, Y of (a x - b y + X, b x + a y + Y), x and y counted from the middle of the corners.
+    covariance : (4, 4) float64
+        Their covariance.
+    left : (8,) float64
+        The residuals.
+    """
+    design, weights, origin = _design(points), whitener(covariance), places.mean(axis=0)
+    observed = (places - origin).ravel()
+    found = np.asarray(np.linalg.inv((weights @ design).T @ (weights @ design)))
+    parameters = found @ (weights @ design).T @ (weights @ observed)
+    return parameters + np.append([0.0, 0.0], origin), found, observed - design @ parameters
+
+
+def _design(points: FloatArray) -> FloatArray:
+    """Return the derivative (8, 4) of the places of corners by the parameters of a similarity."""
+    (x, y), zero, ones = (points - points.mean(axis=0)).T, np.zeros(4), np.ones(4)
+    return np.stack([np.c_[x, -y, ones, zero], np.c_[y, x, zero, ones]], axis=1).reshape(8, 4)

@@ -24,7 +24,7 @@ Transform: TypeAlias = Callable[[FloatArray], FloatArray] | None
 BLOCK = 8192
 #: Step in pixels between exact positions of an image: the largest whose interpolation is as good as exact.
 _NODE_STEPS, _NODE_ERROR_PX = (64, 16, 4), 0.005
-_PER_SIDE = 33  # points on each side of an image's outline
+_PER_SIDE = 32  # points on each side of an image's outline
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,8 @@ def cover(
 
     The grid may have NaN bounds where the image lies outside what the target CRS is made for.
     """
-    corners = Frame(*size).corners
-    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    outline = np.concatenate([np.linspace(a, b, _PER_SIDE)[:-1] for a, b in sides])
-    cross = corners.mean(axis=0) + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])
+    frame = Frame(*size)
+    outline, cross = frame.outline(_PER_SIDE), frame.center + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])
     outline, cross = (Homography(pixel_to_crs)(points) for points in (outline, cross))
     if to_target is not None:
         outline, cross = to_target(outline), to_target(cross)
