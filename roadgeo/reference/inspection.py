@@ -107,6 +107,8 @@ def _describe_shards(path: Path) -> dict[str, Any]:
     shards, filled = manifest.shards, manifest.filled
     are_there = all(reference_paths(shard_path(path, manifest, entry)).index.is_file() for entry in manifest.files)
     west, south, east, north = zip(*(entry.reach for entry in filled), strict=True)
+    if any(entry.reach[0] > entry.reach[2] for entry in filled):  # astride 180 degrees
+        west, east = (-180.0,), (180.0,)
     return {
         "name": manifest.name,
         "freshness": "fresh" if are_there else "shards missing",

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.projection import to_lonlat
+from roadgeo._arrays import IntArray
+from roadgeo.geometry.projection import transformer
 from roadgeo.reference.spool import Bounds, Cell
 
 __all__ = ["ShardBox", "bounds_in_degrees", "plan_shards", "widen"]
@@ -90,17 +90,5 @@ def widen(box: Bounds, margin_m: float, metres: float | None) -> Bounds:
 
 
 def bounds_in_degrees(box: Bounds, crs: str) -> Bounds:
-    """Return west, south, east and north of a box of some CRS."""
-    lonlat = to_lonlat(crs, _rim(box))
-    lonlat = lonlat[np.isfinite(lonlat).all(axis=1)]
-    low, high = lonlat.min(axis=0), lonlat.max(axis=0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _rim(box: Bounds, n: int = 9) -> FloatArray:
-    """Return points along the border of a box."""
-    x0, y0, x1, y1 = box
-    corners: Sequence[tuple[float, float]] = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-    ends = np.array(corners)
-    sides = [np.linspace(a, b, n, endpoint=False) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
-    return np.concatenate(sides)
+    """Return west, south, east and north of a box of some CRS; west > east astride 180 degrees."""
+    return transformer(crs, "EPSG:4326").transform_bounds(*box)

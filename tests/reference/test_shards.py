@@ -88,6 +88,17 @@ def test_a_margin_is_as_wide_in_degrees_as_in_metres():
 
 
 @pytest.mark.parametrize(
+    ("crs", "box", "expected"),
+    [
+        ("EPSG:32660", (7e5, 5e6, 9e5, 5.1e6), (179.54, 45.04, -177.84, 46.02)),
+        ("EPSG:5041", (1e6, 1e6, 3e6, 3e6), (-180.0, 77.31, 180.0, 90.0)),
+    ],
+)
+def test_bounds_astride_180_degrees_and_around_a_pole(crs, box, expected):
+    assert bounds_in_degrees(box, crs) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize(
     ("near", "may"),
     [
         ((10.5, 59.5, 10.0), True),
