@@ -18,7 +18,7 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.evaluation.trials import read_landscape
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.geometry.pose import Pose, PoseOptions, find_pose
+from roadgeo.geometry.pose import Pose, find_pose
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import open_reference
@@ -31,7 +31,7 @@ VIEW = ViewOptions((SIDE, SIDE), None, (0.5, 1.0), (5.0, 45.0), (0.0, 360.0), FO
 
 def true_pose(truth) -> Pose:
     """The exact pose, from the exact homography."""
-    found = find_pose(truth.homography, (SIDE, SIDE), 1e-6 * np.eye(8), PoseOptions(FOCAL))
+    found = find_pose(truth.homography, (SIDE, SIDE), 1e-6 * np.eye(8), FOCAL)
     assert found is not None
     return found
 
@@ -88,7 +88,7 @@ def main() -> None:
             lost += 1
             continue
         truth = true_pose(query.truth)
-        for rows, lens in ((given_focal, PoseOptions(FOCAL)), (unknown, PoseOptions())):
+        for rows, lens in ((given_focal, FOCAL), (unknown, None)):
             found = find_pose(location.homography, (SIDE, SIDE), location.corner_covariance_m2, lens)
             if found is not None:
                 rows.append(compare(found, truth))

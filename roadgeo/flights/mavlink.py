@@ -20,36 +20,16 @@ from typing import Any
 
 from roadgeo.errors import OutputError, how_to_install
 
-__all__ = ["MavlinkOptions", "MavlinkSender", "PositionFix", "fix_of", "has_pymavlink"]
+__all__ = ["MavlinkSender", "PositionFix", "fix_of", "has_pymavlink"]
 
 #: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY and MAV_TYPE_ONBOARD_CONTROLLER: our role for the autopilot.
 _COMPONENT, _TYPE = 197, 18
+#: Our system, which is the vehicle's; the autopilot, its system and component; number of our sensor.
+_SYSTEM, _AUTOPILOT, _SENSOR = 1, (1, 1), 1
 _SRC_VISION = 2
 _COMMAND_EXTERNAL_POSITION = 43003
 #: The time of transmission starts anew after this many seconds: a 32-bit float then resolves milliseconds.
 _WRAP_S = 36_000.0
-
-
-@dataclass(frozen=True)
-class MavlinkOptions:
-    """Who sends, to whom, and how often.
-
-    Attributes
-    ----------
-    system, target_system, target_component : int
-        Our system, which is the vehicle's, and the autopilot.
-    max_rate_hz : float
-        Places that come faster are left out.
-    heartbeat_hz : float
-    sensor_id : int
-    """
-
-    system: int = 1
-    target_system: int = 1
-    target_component: int = 1
-    max_rate_hz: float = 10.0
-    heartbeat_hz: float = 1.0
-    sensor_id: int = 1
 
 
 @dataclass(frozen=True)
@@ -110,16 +90,18 @@ class MavlinkSender:
         Places sent, and those that came too fast.
     """
 
-    def __init__(self, url: str, options: MavlinkOptions | None = None, clock: Callable[[], float] = time.time) -> None:
-        """Connect.
+    def __init__(
+        self, url: str, max_rate_hz: float = 10.0, heartbeat_hz: float = 1.0, clock: Callable[[], float] = time.time
+    ) -> None:
+        """Connect; places that come faster than `max_rate_hz` are left out.
 
         Raises
         ------
         OutputError
             There is no pymavlink, it is too old, or the address cannot be used.
         """
-        self.options, self._clock = options or MavlinkOptions(), clock
-        self._link = _connect(url, self.options)
+        self._least_s, self._beat_s, self._clock = 1.0 / max_rate_hz, 1.0 / heartbeat_hz, clock
+        self._link = _connect(url)
         self._started = clock()
         self._last = -math.inf
         self._lock = threading.Lock()
@@ -138,7 +120,7 @@ class MavlinkSender:
         """Send one place to both kinds of autopilot; return whether it was sent, for it may have come too fast."""
         now = self._clock()
         with self._lock:
-            if now - self._last < 1.0 / self.options.max_rate_hz - 1e-9:
+            if now - self._last < self._least_s - 1e-9:
                 self.n_left_out += 1
                 return False
             self._last = now
@@ -156,17 +138,15 @@ class MavlinkSender:
         self._link.close()
 
     def _send_px4(self, fix: PositionFix, processing_s: float) -> None:
-        options = self.options
         self._link.mav.global_position_sensor_send(
-            options.target_system, options.target_component, options.sensor_id,
+            *_AUTOPILOT, _SENSOR,
             round(fix.taken_s * 1e6), min(round(processing_s * 1e6), 2**32 - 1), _SRC_VISION, 0,
             round(fix.lat * 1e7), round(fix.lon * 1e7), math.nan, math.nan, fix.sigma_m, math.nan,
         )  # fmt: skip
 
     def _send_ardupilot(self, fix: PositionFix, processing_s: float, now: float) -> None:
-        options, mavlink = self.options, self._link.mav
-        mavlink.command_int_send(
-            options.target_system, options.target_component, 0, _COMMAND_EXTERNAL_POSITION, 0, 0,
+        self._link.mav.command_int_send(
+            *_AUTOPILOT, 0, _COMMAND_EXTERNAL_POSITION, 0, 0,
             (now - self._started) % _WRAP_S, processing_s, fix.sigma_m, 0.0,
             round(fix.lat * 1e7), round(fix.lon * 1e7), math.nan,
         )  # fmt: skip
@@ -175,11 +155,11 @@ class MavlinkSender:
         while True:
             with self._lock, contextlib.suppress(OSError):
                 self._link.mav.heartbeat_send(_TYPE, 8, 0, 0, 4)  # no autopilot; active
-            if self._ended.wait(1.0 / self.options.heartbeat_hz):
+            if self._ended.wait(self._beat_s):
                 return
 
 
-def _connect(url: str, options: MavlinkOptions) -> Any:
+def _connect(url: str) -> Any:
     if not has_pymavlink():
         raise OutputError(f"MAVLink needs pymavlink: {how_to_install('mavlink')}")
     form = re.fullmatch(r"(udpout|udpin|udpbcast|tcp|tcpin):[^:\s]+:(\d{1,5})", url)
@@ -191,7 +171,7 @@ def _connect(url: str, options: MavlinkOptions) -> Any:
         from pymavlink import mavutil
 
         mavutil.set_dialect("common")
-        link = mavutil.mavlink_connection(url, source_system=options.system, source_component=_COMPONENT)
+        link = mavutil.mavlink_connection(url, source_system=_SYSTEM, source_component=_COMPONENT)
     except Exception as error:  # pymavlink raises of any kind
         why = f"{type(error).__name__}: {error}"
         raise OutputError(f"cannot send MAVLink to {url}: {why}; expected such as udpout:127.0.0.1:14550") from error

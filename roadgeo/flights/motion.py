@@ -19,11 +19,11 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, RoadSourceError
-from roadgeo.flights.pose import FilterOptions, correct, start
+from roadgeo.flights.pose import FEWEST, MIN_COS, FilterOptions, correct, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.kernels.roads import bin_segments
+from roadgeo.kernels.roads import bin_segments, road_residuals
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
@@ -309,16 +309,14 @@ def _rough_covariance(frame: Frame) -> FloatArray:
 
 def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> float:
     """Return the share of road points inside the other frame that lie on its roads; 0 where hardly any are inside."""
-    from roadgeo.kernels.roads import road_residuals
-
     pixels = Homography(motion)(scene.points * (1.0, -1.0))
     inside = np.asarray(((pixels > 0) & (pixels < (frame.width, frame.height))).all(axis=1))
-    if inside.sum() < 0.1 * len(inside) or inside.sum() < _FILTER.fewest:
+    if inside.sum() < 0.1 * len(inside) or inside.sum() < FEWEST:
         return 0.0
     matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
     points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
     radii, ways = np.full(len(points), 6.0), np.empty((len(points), 3))
-    return road_residuals(matrix, points, along, radii, math.cos(math.radians(25.0)), roads, ways) / len(points)
+    return road_residuals(matrix, points, along, radii, MIN_COS, roads, ways) / len(points)
 
 
 def _buckets(graph: RoadGraph) -> RoadBuckets:

@@ -17,18 +17,18 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.geometry.pose import PoseOptions
+from roadgeo.geometry.pose import USUAL_FOCAL, USUAL_SIGMA
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene
 
-__all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
+__all__ = ["FEWEST", "MIN_COS", "FilterOptions", "Pose", "correct", "predict", "start"]
 
-#: Focal length of usual lenses, in halves of the frame's diagonal, and the standard deviation of its log.
-_LENS = PoseOptions()
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
+#: With fewer road points on roads a frame is not corrected; roads count that run the point's way, within this angle.
+FEWEST, MIN_COS = 20, math.cos(math.radians(25.0))
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,6 @@ class FilterOptions:
         prediction, away; the lesser of the two counts.
     least_radius_m : float
         They are always searched within this radius.
-    max_turn_deg : float
-        Roads count that run the point's way, within this angle.
-    fewest : int
-        With fewer road points on roads a frame is not corrected.
     """
 
     sigma_m: float = 1.2
@@ -57,8 +53,6 @@ class FilterOptions:
     correlation_m: float = 30.0
     radii: tuple[tuple[float, float], ...] = ((25.0, 3.0), (18.0, 2.5), (12.0, 2.0), (8.0, 1.5), (6.0, 1.5))
     least_radius_m: float = 5.0
-    max_turn_deg: float = 25.0
-    fewest: int = 20
 
 
 @dataclass(frozen=True)
@@ -171,7 +165,7 @@ def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
 
 def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> Pose:
     """Return the pose of a frame whose corners (4, 2) are known, with their covariance (8, 8), and of a usual lens."""
-    return Pose(corners, _beside_focal(covariance, _LENS.usual_sigma**2), frame, math.log(_LENS.usual_focal))
+    return Pose(corners, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
 
 
 def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
@@ -245,11 +239,10 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     spacing = scene.road_length_px * gsd / max(len(scene.points), 1)
     share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
     unsure = float(pose.corner_sigma_m.mean())
-    min_cos = math.cos(math.radians(options.max_turn_deg))
     for most_m, deviations in options.radii:
         radius = max(min(most_m, deviations * unsure), options.least_radius_m)
-        normal, right, met = _road_equations(local, p, scene, radius, max(sigma, radius / 3.0), min_cos, roads)
-        if met < options.fewest:
+        normal, right, met = _road_equations(local, p, scene, radius, max(sigma, radius / 3.0), roads)
+        if met < FEWEST:
             return None
         jacobian = local.derivative(p, corners)
         scale = share * (local.unit / sigma) ** 2
@@ -272,14 +265,14 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
 
 
 def _road_equations(
-    local: _Local, p: FloatArray, scene: Scene, radius: float, sigma: float, min_cos: float, roads: RoadBuckets
+    local: _Local, p: FloatArray, scene: Scene, radius: float, sigma: float, roads: RoadBuckets
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return normal (8, 8) and right (8,) sides of normal dp = right, of all points that meet a road, and how many.
 
     Residuals lie across the roads nearer than `radius` metres, in normalised units, with Cauchy weights by `sigma`.
     """
     ways, radii = np.empty((len(scene.points), 3)), np.full(len(scene.points), radius)
-    road_residuals(local.matrix(p), scene.points, scene.directions, radii, min_cos, roads, ways)
+    road_residuals(local.matrix(p), scene.points, scene.directions, radii, MIN_COS, roads, ways)
     uv = local.query(scene.points)
     met = np.isfinite(ways[:, 0]) & (1.0 + uv @ p[6:] >= 0.05)
     away, normals = ways[met, 0], ways[met, 1:]

@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.flights.pose import Pose
 from roadgeo.flights.tracker import Tracked
-from roadgeo.geometry.pose import PoseOptions, find_pose
+from roadgeo.geometry.pose import find_pose
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 from roadgeo.geometry.transformation import LONLAT, exactness
 
@@ -133,7 +133,7 @@ def _row(tracked: Tracked, begun: datetime | None, focal_px: float | None) -> Ro
 def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
     """Find the camera of a focal length behind a frame; None where it would lie below the ground."""
     size = round(pose.frame.width), round(pose.frame.height)
-    found = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], PoseOptions(focal_px=focal_px))
+    found = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], focal_px)
     if found is None:
         return None
     lon, lat = to_lonlat(plane.crs, plane.to_crs(found.position[None, :2]))[0]

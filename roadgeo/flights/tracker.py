@@ -35,6 +35,14 @@ __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Trac
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
+#: The latest of the frames that wait for a place are laid together, up to this number.
+_MOST_FRAMES = 32
+#: A mosaic is located once it shows the first number of intersections, and again after the second number of more
+#: intersections, or the third of more frames.
+_FEWEST, _MORE, _MORE_FRAMES = 6, 2, 3
+#: Number of frames in a row without agreement after which the flight is lost; it is, too, when it may be off by this
+#: share of a frame.
+_PATIENCE, _LOST_FRAMES = 3, 0.3
 
 FrameStatus = Literal["located", "tracked", "predicted", "lost"]
 
@@ -47,31 +55,15 @@ class TrackOptions:
     ----------
     locate : LocateOptions
         How mosaics are located; the hints are of the frames.
-    most_frames : int
-        The latest of the frames that wait for a place are laid together, up to this number.
-    fewest_intersections, more_intersections, more_frames : int
-        A mosaic is located once it shows the first number of intersections, and again after the second number of more
-        intersections, or the third of more frames.
     start_sigma_m : float
         Standard deviation of a located mosaic.
     least_odds : float
         Log10 odds against places nearby by which a tracked frame agrees with the map.
-    patience : int
-        Number of frames in a row without agreement after which the flight is lost.
-    lost_frames : float
-        It is lost, too, when it may be off by this share of a frame.
     """
 
     locate: LocateOptions = field(default_factory=LocateOptions)
-    filter: FilterOptions = field(default_factory=FilterOptions)
-    most_frames: int = 32
-    fewest_intersections: int = 6
-    more_intersections: int = 2
-    more_frames: int = 3
     start_sigma_m: float = 4.0
     least_odds: float = 0.5
-    patience: int = 3
-    lost_frames: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -189,7 +181,7 @@ class Tracker:
             self._doubtful.append(waiting)
         else:
             self._doubtful = []
-        if tracked.status == "lost" or len(self._doubtful) >= self.options.patience:
+        if tracked.status == "lost" or len(self._doubtful) >= _PATIENCE:
             return self._lose(waiting, tracked.reason)
         return [tracked]
 
@@ -209,7 +201,7 @@ class Tracker:
         corrected = (
             None
             if scene is None or reference is None
-            else correct(predicted, scene, reference.index.road_buckets, self.options.filter)
+            else correct(predicted, scene, reference.index.road_buckets, FilterOptions())
         )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
         if corrected is not None and scene is not None and reference is not None:
@@ -220,7 +212,7 @@ class Tracker:
                 return Tracked(frame, status, why, known_at, corrected, reference, odds)
             why = "its roads contradict the map where its motion puts it: it may be a frame's width away"
         frame_m = predicted.frame.half_diagonal * 2.0 * predicted.gsd_m
-        if predicted.sigma_m > self.options.lost_frames * frame_m:
+        if predicted.sigma_m > _LOST_FRAMES * frame_m:
             return Tracked(frame, "lost", "no road has agreed for too long", known_at)
         self._pose = predicted
         stated = predicted if math.isnan(odds) else loosened(predicted, frame_m)
@@ -249,7 +241,7 @@ class Tracker:
         if frame.motion is None or (self._window and self._window[-1].frame.frame != frame.frame):
             self._window = []
             self._forget()
-        self._window = [*self._window, waiting][-self.options.most_frames :]
+        self._window = [*self._window, waiting][-_MOST_FRAMES:]
         masks = [member.frame.mask for member in self._window]
         mosaic = lay_together(masks, [_motion(member) for member in self._window], road_px(masks))
         if mosaic is None:
@@ -258,12 +250,12 @@ class Tracker:
             return [Tracked(frame, "lost", "no camera moves like this; begun anew", frame.number)]
         query = _read(mosaic)
         n_seen = 0 if query is None else len(query.scene.intersections)
-        least = max(self.options.fewest_intersections, self._looked_at + self.options.more_intersections)
+        least = max(_FEWEST, self._looked_at + _MORE)
         if query is None or (n_seen < least and not self._candidates):
             why = f"waits: {len(masks)} frames show {n_seen} intersections, looked for again with {least}"
             return [Tracked(frame, "lost", why, frame.number)]
         self._waited += 1
-        searched = n_seen >= least or self._waited >= self.options.more_frames
+        searched = n_seen >= least or self._waited >= _MORE_FRAMES
         if searched:
             self._looked_at, self._waited = n_seen, 0
         look = Look(query, mosaic, [member.frame.number for member in self._window], searched)

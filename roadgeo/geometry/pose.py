@@ -28,33 +28,15 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.whitening import whitener
 
-#: Focal lengths that an adjustment may start from, in usual ones.
-_FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
+__all__ = ["USUAL_FOCAL", "USUAL_SIGMA", "Pose", "find_pose", "turned"]
 
-__all__ = ["Pose", "PoseOptions", "find_pose", "turned"]
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """Prior knowledge of the lens.
-
-    Attributes
-    ----------
-    focal_px : float or None
-        Focal length, pixels of the frame; None: unknown.
-    usual_focal : float
-        Focal length of usual lenses, in halves of the frame's diagonal.
-    usual_sigma : float
-        Standard deviation of the log of a usual focal length: between 35 and 85 degrees across the diagonal.
-    told_sigma : float
-        The homography counts as determining the focal length if its log has this standard deviation or less.
-    """
-
-    focal_px: float | None = None
-    usual_focal: float = 1.5
-    usual_sigma: float = 0.45
-    told_sigma: float = 0.15
-    n_iterations: int = 30
+#: Focal length of usual lenses, in halves of the frame's diagonal, and the standard deviation of its log: between 35
+#: and 85 degrees across the diagonal.
+USUAL_FOCAL, USUAL_SIGMA = 1.5, 0.45
+#: The homography counts as determining the focal length if its log has this standard deviation or less.
+_DETERMINED = 0.15
+#: Focal lengths that an adjustment may start from, in usual ones; its steps.
+_FACTORS, _STEPS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0), 30
 
 
 @dataclass(frozen=True)
@@ -97,7 +79,7 @@ class Pose:
 
 
 def find_pose(
-    homography: FloatArray, size: tuple[int, int], corner_covariance: FloatArray, options: PoseOptions | None = None
+    homography: FloatArray, size: tuple[int, int], corner_covariance: FloatArray, focal_px: float | None = None
 ) -> Pose | None:
     """Find the camera behind a homography; None where no camera above the ground sees it.
 
@@ -107,22 +89,23 @@ def find_pose(
         Pixel (column, row; corner convention) to plane metres, x east and y north.
     corner_covariance : (8, 8) float64
         Covariance of the corners' x and y on the plane, square metres (see `Location.corner_covariance_m2`).
+    focal_px : float, optional
+        Focal length, pixels of the frame, where it is known.
     """
-    options = options or PoseOptions()
     frame = Frame(*size)
     corners = Homography(homography).facing(frame.center)(frame.corners)
     if not np.isfinite(corners).all():
         return None
     origin = np.append(corners.mean(axis=0), 0.0)  # eastings and northings are large numbers
     homography, corners = shift(-origin[0], -origin[1]) @ homography, corners - origin[:2]
-    usual = options.usual_focal * frame.half_diagonal
-    tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
-    prior = math.log(options.focal_px or usual), 1e-6 if options.focal_px else options.usual_sigma
+    usual = USUAL_FOCAL * frame.half_diagonal
+    tried = [focal_px] if focal_px else [usual * factor for factor in _FACTORS]
+    prior = math.log(focal_px or usual), 1e-6 if focal_px else USUAL_SIGMA
     seen = SeenCorners((frame.corners - frame.center) * (1.0, -1.0), corners, whitener(corner_covariance), *prior)
-    fitted = fit_pinhole(_starts(homography, frame, np.array(tried), seen.log_focal), seen, options.n_iterations)
+    fitted = fit_pinhole(_starts(homography, frame, np.array(tried), seen.log_focal), seen)
     if fitted is None:
         return None
-    pose = _describe(*fitted, seen.log_focal, options)
+    pose = _describe(*fitted, seen.log_focal, bool(focal_px))
     return replace(pose, position=pose.position + origin)
 
 
@@ -140,7 +123,7 @@ class SeenCorners(NamedTuple):
     log_focal_sigma: float
 
 
-def fit_pinhole(starts: FloatArray, seen: SeenCorners, n_iterations: int) -> tuple[FloatArray, FloatArray] | None:
+def fit_pinhole(starts: FloatArray, seen: SeenCorners) -> tuple[FloatArray, FloatArray] | None:
     """Fit a pinhole by Levenberg and Marquardt, from the start (S, 7) that is nearest; None where that fails.
 
     Return its parameters (7,) and their covariance (7, 7).
@@ -155,7 +138,7 @@ def fit_pinhole(starts: FloatArray, seen: SeenCorners, n_iterations: int) -> tup
     p = starts[int(sums.argmin())]
     r, least, damping = off(p), float(sums.min()), 1e-3
     scale = np.array([math.exp(p[2] + p[6])] * 2 + [1.0] * 5)
-    for _ in range(n_iterations):
+    for _ in range(_STEPS):
         jacobian = _differentiate(off, p, scale)
         if not np.isfinite(jacobian).all():
             return None
@@ -258,8 +241,11 @@ def _place(parameters: FloatArray, log_focal: float) -> tuple[FloatArray, FloatA
     return ground + reach * rotations[..., 2], rotations
 
 
-def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, options: PoseOptions) -> Pose:
-    """Take parameters and their covariance to position and angles and their covariance."""
+def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, is_given: bool) -> Pose:
+    """Take parameters and their covariance to position and angles and their covariance.
+
+    `is_given`: the focal length is the camera's own.
+    """
     position, rotation = _place(p, log_focal)
 
     def placed(parameters: FloatArray) -> FloatArray:
@@ -270,8 +256,8 @@ def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, options: 
     reach = math.exp(p[2] + p[6])
     to = _differentiate(placed, p, np.array([reach, reach] + [1.0] * 5))
     focal, sigma = math.exp(p[6]), math.sqrt(covariance[6, 6])
-    source: Literal["camera", "homography", "assumed"] = "homography" if sigma < options.told_sigma else "assumed"
-    if options.focal_px:
+    source: Literal["camera", "homography", "assumed"] = "homography" if sigma < _DETERMINED else "assumed"
+    if is_given:
         source, sigma = "camera", 0.0
     return Pose(position, rotation, to @ covariance @ to.T, focal, focal * sigma, source)
 

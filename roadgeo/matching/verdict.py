@@ -15,7 +15,7 @@ from roadgeo.geometry.camera import CameraOptions, pose
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.geometry.pose import PoseOptions, find_pose, turned
+from roadgeo.geometry.pose import find_pose, turned
 from roadgeo.geometry.projection import LocalPlane, from_lonlat, grid_north, metres_apart, to_lonlat
 from roadgeo.geometry.similarity import find_similarity
 from roadgeo.geometry.transformation import LONLAT, exactness
@@ -442,7 +442,7 @@ def _find_camera(
     """
     if fit.corner_covariance_m2 is None:
         return None
-    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, PoseOptions(focal_px))
+    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, focal_px)
     if found is None:
         return None
     plane, rotation = fit.index.plane, turned(found.rotation, -north)

@@ -1,6 +1,6 @@
 """From a road mask to a road graph: clean, thin, trace, prune.
 
-All lengths scale with the mask's own road width, so that options hold for masks of any resolution. Wide roads are
+All lengths scale with the mask's own road width, so that limits hold for masks of any resolution. Wide roads are
 thinned on a grid reduced to roads a few pixels wide; centre lines are then placed between its pixels.
 """
 
@@ -18,7 +18,7 @@ from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize", "width_by_area"]
+__all__ = ["Vectorization", "road_width", "vectorize", "width_by_area"]
 
 #: Bands of rows that `width_by_area` looks at first, and how many road pixels they must hold.
 _BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD, _MAX_BAND_PIXELS = 48, 192, 2000, 1 << 24
@@ -36,61 +36,29 @@ _BENDS, _NEAR = 11, 2
 
 _MAX_ROUNDS = 3  # of pruning; later ones find too little for their time
 
-
-@dataclass(frozen=True)
-class VectorizeOptions:
-    """How a mask is cleaned and traced. Names in `_widths` count road widths, `_areas` squared road widths.
-
-    Attributes
-    ----------
-    working_width_px
-        Wide roads are reduced to about this width before thinning.
-    max_working_pixels
-        Larger masks are reduced further, at some loss, so that memory is bounded.
-    max_corners
-        A mask whose outlines have more is noise and is refused before it is cleaned. Real masks have up to 11 for a
-        thousand pixels, 0.7 million where they are as large as can be.
-    max_pieces
-        A mask that falls into more pieces of road is noise and is refused, so that time and memory are bounded.
-    max_cover
-        Traced lines are noise, too, if roads of their length and width would cover more than this share of the frame:
-        the roads of a dense town cover 0.16.
-    closing_widths, opening_widths
-        Gaps up to this are closed; threads up to this are cut.
-    hole_areas, speck_areas
-        Smaller holes are filled; smaller pieces are dropped.
-    spur_widths
-        Free ends that reach less than this beyond the edge of the road they leave are dropped.
-    piece_widths
-        Roads that touch no other are dropped when they are shorter.
-    bridge_widths
-        A road that ends, and points at another across a gap up to this, is joined to it.
-    bridge_angle_deg
-        How far from its own direction it may bend to get there.
-    bent_widths
-        Within this distance of a junction a skeleton is bent: the road is drawn straight there.
-    smoothing_widths
-        Standard deviation of the smoothing along a road.
-    vertex_spacing_px
-        Distance between the vertices of a road.
-    """
-
-    working_width_px: float = 6.0
-    max_working_pixels: int = 64_000_000
-    max_corners: int = 3_000_000
-    max_pieces: int = 300_000
-    max_cover: float = 1.0
-    closing_widths: float = 0.35
-    opening_widths: float = 0.3
-    hole_areas: float = 1.2
-    speck_areas: float = 1.0
-    spur_widths: float = 1.3
-    piece_widths: float = 2.0
-    bridge_widths: float = 1.0
-    bridge_angle_deg: float = 35.0
-    bent_widths: float = 0.4
-    smoothing_widths: float = 0.4
-    vertex_spacing_px: float = 2.0
+#: Wide roads are reduced to about this width before thinning; larger masks further, at some loss: memory is bounded.
+_WORKING_WIDTH_PX, _MAX_WORKING_PIXELS = 6.0, 64_000_000
+#: A mask is noise and is refused where its outlines have more corners, before it is cleaned: real masks have up to 11
+#: for a thousand pixels, 0.7 million where they are as large as can be. So it is where it falls into more pieces of
+#: road: time and memory are bounded.
+_MAX_CORNERS, _MAX_PIECES = 3_000_000, 300_000
+#: And where roads of the lines' length and width would cover more of the frame: those of a dense town cover 0.16.
+_MAX_COVER = 1.0
+#: Road widths: gaps up to this are closed, threads up to this are cut.
+_CLOSING, _OPENING = 0.35, 0.3
+#: Squared road widths: smaller holes are filled, smaller pieces are dropped.
+_HOLE, _SPECK = 1.2, 1.0
+#: Road widths: free ends are dropped that reach less beyond the edge of the road they leave, and roads that touch no
+#: other and are shorter.
+_SPUR, _PIECE = 1.3, 2.0
+#: A road that ends, and points at another across a gap up to so many road widths, is joined to it; it may bend so far
+#: from its own direction to get there.
+_BRIDGE, _BRIDGE_DEG = 1.0, 35.0
+#: Road widths: so near a junction a skeleton is bent, and the road is drawn straight; standard deviation of the
+#: smoothing along a road.
+_BENT, _SMOOTHING = 0.4, 0.4
+#: Distance between the vertices of a road.
+_VERTEX_SPACING_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -112,13 +80,12 @@ class Vectorization:
     is_open: BoolArray
 
 
-def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vectorization:
+def vectorize(mask: RoadMask) -> Vectorization:
     """Trace the centre lines of a mask's roads.
 
     Parameters
     ----------
     mask : RoadMask
-    options : VectorizeOptions, optional
 
     Returns
     -------
@@ -129,25 +96,24 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     MaskError
         When the mask shows no road.
     """
-    options = options or VectorizeOptions()
     width_px = road_width(mask)
-    crowded = np.ceil(np.sqrt(mask.roads.size / options.max_working_pixels))
+    crowded = np.ceil(np.sqrt(mask.roads.size / _MAX_WORKING_PIXELS))
     # Nothing wider than the frame is a road; a grid much coarser than the frame would be filled up to whole cells.
-    factor = int(max(min(round(width_px / options.working_width_px), *mask.shape), crowded, 1))
+    factor = int(max(min(round(width_px / _WORKING_WIDTH_PX), *mask.shape), crowded, 1))
     width = max(width_px / factor, 1.0)
     states = _reduce(mask, factor, min(0.5, 0.45 * width_px / factor))
-    _refuse_corners(states, mask.name or "mask", options)
-    states = _clean(states, width, options)
+    _refuse_corners(states, mask.name or "mask")
+    states = _clean(states, width)
     distance = cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
-    skeleton = _skeletonize(states, distance, width, options)
-    _refuse_noise(skeleton, width, states.size, mask.name or "mask", options)
+    skeleton = _skeletonize(states, distance, width)
+    _refuse_noise(skeleton, width, states.size, mask.name or "mask")
     if len(skeleton.edges) == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road is left after cleaning; expected roads as non-zero pixels")
-    graph, is_open = _to_graph(skeleton, distance, factor, width, options)
+    graph, is_open = _to_graph(skeleton, distance, factor, width)
     return Vectorization(graph, width_px, is_open)
 
 
-def _refuse_corners(states: AnyArray, name: str, options: VectorizeOptions) -> None:
+def _refuse_corners(states: AnyArray, name: str) -> None:
     """Refuse what has outlines without number before they are walked along: each has a corner at its upper left."""
     n_corners = 0
     rows = max(_STRIP_PIXELS // states.shape[1], 2)
@@ -155,20 +121,20 @@ def _refuse_corners(states: AnyArray, name: str, options: VectorizeOptions) -> N
         roads = states[top : top + rows + 1] != GROUND
         here, left, above = roads[1:, 1:], roads[1:, :-1], roads[:-1, 1:]
         n_corners += int(np.count_nonzero((here != left) & (here != above)))
-    if n_corners > options.max_corners:
+    if n_corners > _MAX_CORNERS:
         raise MaskError(
-            f"{name}: its roads have {n_corners:,} corners, expected at most {options.max_corners:,}: this looks like "
+            f"{name}: its roads have {n_corners:,} corners, expected at most {_MAX_CORNERS:,}: this looks like "
             "noise; smooth it before it is thresholded, or reduce it"
         )
 
 
-def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, options: VectorizeOptions) -> None:
+def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str) -> None:
     """Refuse lines that cannot be roads, before all slow steps: hatching, halftones, noise."""
     n_pieces, covered = len(skeleton.edges), float(skeleton.lengths.sum()) * width / area
-    counted = f"{n_pieces:,} pieces of road, expected at most {options.max_pieces:,}"
-    if covered > options.max_cover:
+    counted = f"{n_pieces:,} pieces of road, expected at most {_MAX_PIECES:,}"
+    if covered > _MAX_COVER:
         counted = f"{n_pieces:,} pieces of road that would cover {covered:.0%} of the frame"
-    elif n_pieces <= options.max_pieces:
+    elif n_pieces <= _MAX_PIECES:
         return
     raise MaskError(
         f"{name}: falls into {counted}: this looks like noise; smooth it before it is thresholded, or reduce it"
@@ -294,19 +260,19 @@ def _shrink(flags: AnyArray, factor: int, share: float) -> AnyArray:
     return reduced
 
 
-def _clean(states: AnyArray, width: float, options: VectorizeOptions) -> AnyArray:
+def _clean(states: AnyArray, width: float) -> AnyArray:
     """Close gaps, fill holes, drop specks and cut threads."""
     cleaned = (states != GROUND).view(np.uint8)
-    cleaned = _morph(cleaned, cv2.MORPH_CLOSE, options.closing_widths * width)
+    cleaned = _morph(cleaned, cv2.MORPH_CLOSE, _CLOSING * width)
     # As a list: finding which hole lies in which piece takes OpenCV time with the square of their number.
     contours, _ = cv2.findContours(cleaned, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     oriented = np.array([cv2.contourArea(contour, True) for contour in contours])
     areas, is_hole = np.abs(oriented), oriented > 0  # pieces run the other way round, or enclose nothing
-    small = np.where(is_hole, areas < options.hole_areas * width**2, areas < options.speck_areas * width**2)
+    small = np.where(is_hole, areas < _HOLE * width**2, areas < _SPECK * width**2)
     for inside, value in ((is_hole, ROAD), (~is_hole, GROUND)):
         chosen = [contours[i] for i in np.flatnonzero(small & inside).tolist()]
         cv2.drawContours(cleaned, chosen, -1, value, cv2.FILLED)
-    cleaned = _morph(cleaned, cv2.MORPH_OPEN, options.opening_widths * width)
+    cleaned = _morph(cleaned, cv2.MORPH_OPEN, _OPENING * width)
     cleaned[states == SOLID] = SOLID
     return cleaned
 
@@ -353,7 +319,7 @@ class _Skeleton:
         return np.maximum(np.diff(self.offsets) + 1.0, np.hypot(*(a - b).T))
 
 
-def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options: VectorizeOptions) -> _Skeleton:
+def _skeletonize(states: AnyArray, distance: Float32Array, width: float) -> _Skeleton:
     """Thin, then prune and bridge until nothing is left to do. `states` is changed; lengths in its pixels."""
     flat = states.ravel()
     room = np.empty(len(flat), np.int32)
@@ -361,13 +327,13 @@ def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options
     bridged = False
     for round_ in range(_MAX_ROUNDS):
         skeleton = _Skeleton(*trace(states, pixels, room))
-        if len(skeleton.edges) > options.max_pieces:
+        if len(skeleton.edges) > _MAX_PIECES:
             return skeleton
-        drop = _spurs(skeleton, distance, options.spur_widths * width) | _pieces(skeleton, options.piece_widths * width)
+        drop = _spurs(skeleton, distance, _SPUR * width) | _pieces(skeleton, _PIECE * width)
         _erase(states, skeleton, drop)
         bridges = np.empty(0, np.int32)
         if not bridged and (round_ > 0 or not drop.any()):
-            bridges = _bridges(states, distance, skeleton, ~drop, width, options)
+            bridges = _bridges(states, distance, skeleton, ~drop, width)
             bridged = True
         if bridged and not drop.any() and len(bridges) == 0:
             return skeleton
@@ -407,7 +373,6 @@ def _bridges(
     skeleton: _Skeleton,
     stands: BoolArray,
     width: float,
-    options: VectorizeOptions,
 ) -> Int32Array:
     """Return pixels that join free ends of the chains that stand, (E,), to the roads they point at; mark them as ROAD.
 
@@ -417,13 +382,13 @@ def _bridges(
     flat, stride = states.ravel(), states.shape[1]
     edge, side = np.nonzero(skeleton.tips & (stands & (skeleton.lengths >= width))[:, None])
     tip = skeleton.xy[skeleton.edges[edge, side]]
-    at = _fans(states.shape, tip, _headings(skeleton, edge, side, tip, 2.0 * width, stride), width, options)
+    at = _fans(states.shape, tip, _headings(skeleton, edge, side, tip, 2.0 * width, stride), width)
     met = cv2.dilate((states == ROAD).view(np.uint8), np.ones((3, 3), np.uint8)).ravel()[at]
     met[flat[at] == SOLID] = SOLID
     met[..., :_NEAR] = GROUND  # the road's own end
     first = np.argmax(met != GROUND, axis=2)[..., None]
     missing = np.take_along_axis(np.cumsum(distance.ravel()[at] == 0, axis=2), first, axis=2)
-    good = (np.take_along_axis(met, first, axis=2) == ROAD) & (missing <= options.bridge_widths * width + 0.5)
+    good = (np.take_along_axis(met, first, axis=2) == ROAD) & (missing <= _BRIDGE * width + 0.5)
     bend = np.linspace(-1, 1, _BENDS)[:, None]
     cost = np.where(good, (first + 1) * (1 + bend**2), np.inf)[..., 0]
     best = np.argmin(cost, axis=1)
@@ -450,30 +415,26 @@ def _headings(
     return np.asarray(np.arctan2(tip[:, 1] - rows, tip[:, 0] - columns))
 
 
-def _fans(
-    shape: tuple[int, int], tip: FloatArray, heading: FloatArray, width: float, options: VectorizeOptions
-) -> IntArray:
+def _fans(shape: tuple[int, int], tip: FloatArray, heading: FloatArray, width: float) -> IntArray:
     """Return flat indices (tips, bends, steps) of the pixels on rays that fan out from free ends."""
-    limit = np.radians(options.bridge_angle_deg)
-    steps = np.arange(1, int((options.bridge_widths + 1.5) * width) + 3)  # the gap, and half a road at either side
+    limit = np.radians(_BRIDGE_DEG)
+    steps = np.arange(1, int((_BRIDGE + 1.5) * width) + 3)  # the gap, and half a road at either side
     angle = (heading[:, None] + np.linspace(-limit, limit, _BENDS))[..., None]
     columns = np.rint(tip[:, 0, None, None] + steps * np.cos(angle)).astype(np.int64).clip(0, shape[1] - 1)
     rows = np.rint(tip[:, 1, None, None] + steps * np.sin(angle)).astype(np.int64).clip(0, shape[0] - 1)
     return np.asarray(rows * shape[1] + columns)
 
 
-def _to_graph(
-    skeleton: _Skeleton, distance: Float32Array, factor: int, width: float, options: VectorizeOptions
-) -> tuple[RoadGraph, BoolArray]:
+def _to_graph(skeleton: _Skeleton, distance: Float32Array, factor: int, width: float) -> tuple[RoadGraph, BoolArray]:
     """Smooth the chains and take them to the query plane; `width` in reduced pixels."""
     skeleton = _part_open_ends(skeleton)
     keep = skeleton.lengths > width  # loops, and links along the frame, that are shorter than a road is wide
     keep |= ~skeleton.is_open[skeleton.edges].any(axis=1) & (skeleton.edges[:, 0] != skeleton.edges[:, 1])
     edges, xy = skeleton.edges, skeleton.xy
-    passes = max(1, round(2.0 * (options.smoothing_widths * width) ** 2))  # each adds a variance of 1/2
-    spacing = max(1, round(options.vertex_spacing_px / factor))
+    passes = max(1, round(2.0 * (_SMOOTHING * width) ** 2))  # each adds a variance of 1/2
+    spacing = max(1, round(_VERTEX_SPACING_PX / factor))
     ends = np.concatenate((xy[edges[:, 0]], xy[edges[:, 1]]), axis=1)
-    bent = np.where(skeleton.degree >= 3, round(options.bent_widths * width), 0)
+    bent = np.where(skeleton.degree >= 3, round(_BENT * width), 0)
     coords, offsets = smooth_chains(distance, skeleton.chain, skeleton.offsets, ends, bent[edges], passes, spacing)
     coords, xy = _to_plane(coords, factor), _to_plane(xy, factor)
     polylines = [coords[offsets[e] : offsets[e + 1]] for e in np.flatnonzero(keep)]

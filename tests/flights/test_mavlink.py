@@ -8,7 +8,7 @@ import pytest
 from support.mavlink_peer import free_port, listening, of_kind
 
 from roadgeo.errors import OutputError
-from roadgeo.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, fix_of, has_pymavlink
+from roadgeo.flights.mavlink import MavlinkSender, PositionFix, fix_of, has_pymavlink
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +20,7 @@ def talk(fixes, count, lose=0, pause_s=0.0, **options):
 
     Return what it decoded, and the sender.
     """
-    with listening(count, lose) as (url, heard), MavlinkSender(url, MavlinkOptions(**options)) as sender:
+    with listening(count, lose) as (url, heard), MavlinkSender(url, **options) as sender:
         for fix in fixes:
             sender.send(replace(fix, taken_s=time.time() - fix.taken_s))
             time.sleep(pause_s)
@@ -56,9 +56,7 @@ def test_a_peer_decodes_what_was_sent():
 @needs
 def test_places_that_come_too_fast_are_left_out():
     clock = iter([0.0, *(0.01 * k for k in range(100))])
-    with MavlinkSender(
-        f"udpout:127.0.0.1:{free_port()}", MavlinkOptions(max_rate_hz=10.0), lambda: next(clock)
-    ) as sender:
+    with MavlinkSender(f"udpout:127.0.0.1:{free_port()}", clock=lambda: next(clock)) as sender:
         sent = [sender.send(PositionFix(1.0, 2.0, 3.0, 0.0)) for _ in range(100)]
     assert sent == [k % 10 == 0 for k in range(100)]
     assert (sender.n_sent, sender.n_left_out) == (10, 90)

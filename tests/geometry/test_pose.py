@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadgeo.geometry.pinhole import make_view
-from roadgeo.geometry.pose import Pose, PoseOptions, find_pose, turned
+from roadgeo.geometry.pose import Pose, find_pose, turned
 
 SIZE = (1200, 900)
 FOCAL = 1000.0
@@ -23,7 +23,7 @@ def view_of(tilt: float, azimuth: float = 70.0, heading: float = 30.0, gsd: floa
 @pytest.mark.parametrize("heading", [-170.0, 10.0])
 def test_a_known_camera_is_found_exactly(tilt: float, heading: float) -> None:
     homography, position, axis = view_of(tilt, heading=heading)
-    found = find_pose(homography, SIZE, 0.04 * np.eye(8), PoseOptions(FOCAL))
+    found = find_pose(homography, SIZE, 0.04 * np.eye(8), FOCAL)
     assert found is not None
     assert found.source == "camera"
     assert found.position == pytest.approx(position, abs=1e-3)
@@ -65,8 +65,8 @@ def test_a_focal_length_that_the_homography_does_not_tell_is_the_usual_one(tilt:
         assert found.position[2] == pytest.approx(position[2] * 1.125, rel=1e-3)
 
 
-@pytest.mark.parametrize("options", [PoseOptions(FOCAL), PoseOptions()])
-def test_its_covariance_is_that_of_many_trials(options: PoseOptions) -> None:
+@pytest.mark.parametrize("focal_px", [FOCAL, None])
+def test_its_covariance_is_that_of_many_trials(focal_px: float | None) -> None:
     homography, position, _ = view_of(35.0)
     import cv2
 
@@ -80,7 +80,7 @@ def test_its_covariance_is_that_of_many_trials(options: PoseOptions) -> None:
         shaken = corners + rng.normal(0, spread, (4, 2)) - corners[0]
         matrix = cv2.getPerspectiveTransform(Frame(*SIZE).corners.astype(np.float32), shaken.astype(np.float32))
         matrix = np.array([[1, 0, corners[0, 0]], [0, 1, corners[0, 1]], [0, 0, 1]]) @ matrix
-        found = find_pose(matrix, SIZE, spread**2 * np.eye(8), options)
+        found = find_pose(matrix, SIZE, spread**2 * np.eye(8), focal_px)
         assert found is not None
         errors.append((found.position - position) / np.sqrt(np.diag(found.covariance)[:3]))
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.3
@@ -108,4 +108,4 @@ def test_another_north_changes_the_heading_only() -> None:
 
 def test_no_camera_sees_a_mirrored_or_broken_frame() -> None:
     homography, _, _ = view_of(20.0)
-    assert find_pose(np.diag([-1.0, 1.0, 1.0]) @ homography, SIZE, np.eye(8), PoseOptions(FOCAL)) is None
+    assert find_pose(np.diag([-1.0, 1.0, 1.0]) @ homography, SIZE, np.eye(8), FOCAL) is None

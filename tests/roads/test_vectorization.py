@@ -16,7 +16,7 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import find_intersections
-from roadgeo.roads.vectorization import Vectorization, VectorizeOptions, road_width, vectorize
+from roadgeo.roads.vectorization import Vectorization, road_width, vectorize
 
 Line = list[tuple[float, float]]
 
@@ -167,10 +167,11 @@ def test_unobserved_ground_cuts_roads_without_junctions() -> None:
     assert observed[inside[:, 1], inside[:, 0]].all()
 
 
-def test_a_mask_is_reduced_where_it_is_large() -> None:
+def test_a_mask_is_reduced_where_it_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadgeo.roads.vectorization._MAX_WORKING_PIXELS", 20_000)  # 3 px in one pixel
     lines = [[(-50.0, 100.0), (450.0, 130.0)], [(200.0, -50.0), (180.0, 450.0)]]
     roads = drawn(lines, 3, 400)
-    graph = vectorize(RoadMask(roads), VectorizeOptions(max_working_pixels=20_000)).graph  # 3 px in one pixel
+    graph = vectorize(RoadMask(roads)).graph
     assert (graph.degree() == 1).sum() == 4
     assert np.sqrt(np.mean(off(graph, lines) ** 2)) < 1.5
 
