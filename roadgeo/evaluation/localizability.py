@@ -16,7 +16,9 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.evaluation.scoring import share
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.geometry.warping import MapGrid
 from roadgeo.outputs.drawing.layers import Layer, Lines, Picture, rgb
 from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_scale_bar, write_text
 from roadgeo.roads.network import RoadNetwork
@@ -67,8 +69,8 @@ class PlaceGrid:
 
     Attributes
     ----------
-    west, north, cell_m : float
-        As in `LocalizabilityMap`.
+    cells : MapGrid
+        On the plane.
     covered : (R, C) bool
         Where the map knows the roads.
     footprint_m2 : float
@@ -80,9 +82,7 @@ class PlaceGrid:
     """
 
     plane: LocalPlane
-    west: float
-    north: float
-    cell_m: float
+    cells: MapGrid
     footprint_m2: float
     covered: BoolArray
     counts: AnyArray
@@ -92,8 +92,8 @@ class PlaceGrid:
         """Draw (count, 2) positions, uniform over the covered cells that `where` (R, C) allows, or over all if none."""
         cells = np.argwhere(self.covered & where)
         cells = cells if len(cells) else np.argwhere(self.covered)
-        row, column = (cells[rng.integers(len(cells), size=count)] + rng.random((count, 2))).T
-        return np.column_stack([self.west + column * self.cell_m, self.north - row * self.cell_m])
+        at = cells[rng.integers(len(cells), size=count)] + rng.random((count, 2))
+        return Homography(self.cells.to_crs_matrix())(at[:, ::-1])
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class LocalizabilityMap:
 
     def at(self, xy: FloatArray) -> AnyArray:
         """Classes at (K, 2) plane positions."""
-        row, column = _cells(xy, self.grid)
+        row, column = _at(xy, self.grid.cells)
         inside = (row >= 0) & (row < self.classes.shape[0]) & (column >= 0) & (column < self.classes.shape[1])
         found = np.full(len(xy), UNKNOWN, np.uint8)
         found[inside] = self.classes[row[inside], column[inside]]
@@ -129,10 +129,9 @@ def lay_grid(network: RoadNetwork, footprint_m2: float) -> PlaceGrid:
     coords = network.graph.coords
     (west, south), (east, north) = coords.min(axis=0), coords.max(axis=0)
     cell = max(math.sqrt(footprint_m2) / _CELLS_PER_WINDOW, max(east - west, north - south) / _MAX_CELLS)
-    shape = math.ceil((north - south) / cell), math.ceil((east - west) / cell)
-    counts, features = _features(network, west, north, cell, shape, math.sqrt(footprint_m2 / math.pi))
-    covered = _covered(network, west, north, cell, shape)
-    return PlaceGrid(network.plane, float(west), float(north), cell, footprint_m2, covered, counts, features)
+    cells = MapGrid(float(west), float(north), cell, math.ceil((east - west) / cell), math.ceil((north - south) / cell))
+    counts, features = _features(network, cells, math.sqrt(footprint_m2 / math.pi))
+    return PlaceGrid(network.plane, cells, footprint_m2, _covered(network, cells), counts, features)
 
 
 def map_localizability(grid: PlaceGrid, places: FloatArray, located: BoolArray) -> LocalizabilityMap:
@@ -145,8 +144,7 @@ def map_localizability(grid: PlaceGrid, places: FloatArray, located: BoolArray) 
     located : (T,) bool
         Which of them were located.
     """
-    shape = grid.counts.shape
-    row, column = (np.clip(at, 0, n - 1) for at, n in zip(_cells(places, grid), shape, strict=True))
+    row, column = _near(places, grid.cells)
     intercept, *weights = _fit(grid.features[row, column], located)
     probability = _logistic(grid.features @ weights + intercept)
     threshold = _threshold(probability[row, column], located)
@@ -165,32 +163,28 @@ def map_localizability(grid: PlaceGrid, places: FloatArray, located: BoolArray) 
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 
-def _cells(xy: FloatArray, grid: PlaceGrid) -> tuple[AnyArray, AnyArray]:
+def _at(xy: FloatArray, cells: MapGrid) -> tuple[AnyArray, AnyArray]:
     """Rows and columns of the cells that (K, 2) positions lie in."""
-    return _rows(xy, grid.north, grid.cell_m), _columns(xy, grid.west, grid.cell_m)
+    column, row = np.floor((xy - (cells.west, cells.north)) * (1.0, -1.0) / cells.resolution).astype(int).T
+    return row, column
 
 
-def _rows(xy: FloatArray, north: float, cell: float) -> AnyArray:
-    return np.floor((north - xy[:, 1]) / cell).astype(int)
+def _near(xy: FloatArray, cells: MapGrid) -> tuple[AnyArray, AnyArray]:
+    """Rows and columns of the cells that lie nearest to (K, 2) positions."""
+    row, column = _at(xy, cells)
+    return np.clip(row, 0, cells.height - 1), np.clip(column, 0, cells.width - 1)
 
 
-def _columns(xy: FloatArray, west: float, cell: float) -> AnyArray:
-    return np.floor((xy[:, 0] - west) / cell).astype(int)
-
-
-def _features(
-    network: RoadNetwork, west: float, north: float, cell: float, shape: tuple[int, int], radius: float
-) -> tuple[AnyArray, FloatArray]:
+def _features(network: RoadNetwork, cells: MapGrid, radius: float) -> tuple[AnyArray, FloatArray]:
     """Count intersections within `radius` of every cell, and make the features of a `PlaceGrid`."""
     found = network.intersections
-    reach = round(radius / cell)
+    reach = round(radius / cells.resolution)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    disc = (np.hypot(x, y) * cell <= radius).astype(np.float32)
+    disc = (np.hypot(x, y) * cells.resolution <= radius).astype(np.float32)
 
     def spread(xy: FloatArray) -> AnyArray:
-        layer = np.zeros(shape, np.float32)
-        row, column = _rows(xy, north, cell), _columns(xy, west, cell)
-        np.add.at(layer, (np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)), 1.0)
+        layer = np.zeros((cells.height, cells.width), np.float32)
+        np.add.at(layer, _near(xy, cells), 1.0)
         return np.maximum(cv2.filter2D(layer, -1, disc, borderType=cv2.BORDER_CONSTANT), 0.0)
 
     counts = np.round(spread(found.xy))
@@ -247,12 +241,11 @@ def _threshold(probability: FloatArray, located: BoolArray) -> float:
     return max(float(probability[order[last[-1]]]), _MIN_PROBABILITY) if len(last) else math.inf
 
 
-def _covered(network: RoadNetwork, west: float, north: float, cell: float, shape: tuple[int, int]) -> BoolArray:
+def _covered(network: RoadNetwork, cells: MapGrid) -> BoolArray:
     """(R, C) whether the map knows the roads of a cell."""
-    if not network.coverage:
-        return np.ones(shape, bool)
-    inside = np.zeros(shape, np.uint8)
-    rings = [np.rint((ring - (west, north)) * (16 / cell, -16 / cell)).astype(np.int32) for ring in network.coverage]
+    inside = np.full((cells.height, cells.width), not network.coverage, np.uint8)
+    scale, corner = (16.0 / cells.resolution) * np.array([1.0, -1.0]), (cells.west, cells.north)
+    rings = [np.rint((ring - corner) * scale).astype(np.int32) for ring in network.coverage]
     cv2.fillPoly(inside, rings, 1, cv2.LINE_8, 4)  # rings within rings are holes
     return inside.astype(bool)
 
@@ -264,10 +257,10 @@ def to_geotiff(found: LocalizabilityMap) -> bytes:
     """Write the classes (band 1, with a colour table) and the probability in percent (band 2) as a GeoTIFF."""
     import rasterio
 
-    grid = found.grid
-    x, y = grid.plane.to_crs(np.array([grid.west, grid.north]))
+    grid, cells = found.grid, found.grid.cells
+    x, y = grid.plane.to_crs(np.array([cells.west, cells.north]))
     height, width = found.classes.shape
-    place = {"crs": grid.plane.crs, "transform": rasterio.Affine(grid.cell_m, 0.0, x, 0.0, -grid.cell_m, y)}
+    place = {"crs": grid.plane.crs, "transform": rasterio.Affine(cells.resolution, 0.0, x, 0.0, -cells.resolution, y)}
     kind = {"compress": "deflate", "interleave": "band", "photometric": "minisblack"}
     percent = np.where(np.isnan(found.probability), 255, np.nan_to_num(found.probability) * 100).round()
     with rasterio.MemoryFile() as memory:
@@ -283,11 +276,11 @@ def to_geotiff(found: LocalizabilityMap) -> bytes:
 
 def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str) -> AnyArray:
     """Draw the map over its roads, with legend and scale: (height, width, 3) uint8, red, green, blue."""
-    grid, colors = found.grid, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
+    cells, colors = found.grid.cells, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
     rows, columns = found.classes.shape
-    box = (0.0, 0.0, columns * grid.cell_m, rows * grid.cell_m)
+    box = (0.0, 0.0, columns * cells.resolution, rows * cells.resolution)
     canvas = Canvas.of(box, _LONGER_PX, _LONGER_PX)
-    lines = [(line - (grid.west, grid.north)) * (1.0, -1.0) for line in network.graph.polylines()]
+    lines = [(line - (cells.west, cells.north)) * (1.0, -1.0) for line in network.graph.polylines()]
     classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
     canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])
     draw_scale_bar(canvas, 22)

@@ -47,14 +47,15 @@ def network(coverage=()):
 def trials(grid, rng, count=400):
     """Masks are located where they show 12 intersections or more, with some luck on either side."""
     places = grid.draw(count, np.ones(grid.covered.shape, bool), rng)
-    row = ((grid.north - places[:, 1]) / grid.cell_m).astype(int)
-    column = ((places[:, 0] - grid.west) / grid.cell_m).astype(int)
+    row = ((grid.cells.north - places[:, 1]) / grid.cells.resolution).astype(int)
+    column = ((places[:, 0] - grid.cells.west) / grid.cells.resolution).astype(int)
     return places, grid.counts[row, column] + rng.normal(0, 1.5, count) >= 12
 
 
 def test_cells_count_the_intersections_around_them():
     grid = lay_grid(network(), math.pi * 200.0**2)
-    row, column = int((grid.north - 950.0) / grid.cell_m), int((950.0 - grid.west) / grid.cell_m)
+    cells = grid.cells
+    row, column = int((cells.north - 950.0) / cells.resolution), int((950.0 - cells.west) / cells.resolution)
     around = np.hypot(*(TOWN.intersections - (950.0, 950.0)).T) < 200.0
     assert grid.counts[row, column] == pytest.approx(around.sum(), abs=2)
     assert grid.counts[row, -1] == 0
@@ -121,8 +122,9 @@ def test_outputs_are_where_they_belong():
     found = map_localizability(grid, *trials(grid, np.random.default_rng(0)))
     with rasterio.MemoryFile(to_geotiff(found)) as memory, memory.open() as raster:
         assert raster.crs.to_epsg() == 32619
-        assert raster.res == (grid.cell_m, grid.cell_m)
-        assert (raster.bounds.left, raster.bounds.top) == pytest.approx((300000 + grid.west, 4600000 + grid.north))
+        cells = grid.cells
+        assert raster.res == (cells.resolution, cells.resolution)
+        assert (raster.bounds.left, raster.bounds.top) == pytest.approx((300000 + cells.west, 4600000 + cells.north))
         assert np.array_equal(raster.read(1), found.classes)
         assert raster.read(2).max() <= 100
         assert raster.count == 2
