@@ -46,7 +46,6 @@ PIXELS = ""
 _WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3, "MULTIPOLYGON": 6}
 _CUSTOM_SRS_ID = 100_000  # for a CRS without an EPSG code; one such CRS per layer is numbered upwards from here
 _SQL_TYPES = {"b": "BOOLEAN", "i": "INTEGER", "u": "INTEGER", "f": "REAL"}  # by numpy's kinds
-_POINT = np.dtype([("header", "S4"), ("srs_id", "<i4"), ("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _HEADER = struct.Struct("<4si4d")  # magic, version and flags; srs_id; envelope min x, max x, min y, max y
 _ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
 
@@ -309,31 +308,22 @@ def _sql_values(values: Sequence[Any] | AnyArray, sql_type: str) -> list[Any]:
 
 def _encode(kind: GeometryType, geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
     """GeoPackage blobs, and (N, 4) bounds min x, max x, min y, max y."""
-    if kind == "POINT":
-        xy = np.asarray(geometries, float).reshape(-1, 2)
-        records = np.zeros(len(xy), _POINT)
-        records["header"], records["srs_id"], records["order"], records["type"] = b"GP\0\1", srs_id, 1, 1
-        records["xy"] = xy
-        raw = records.tobytes()
-        size = _POINT.itemsize
-        return [raw[i : i + size] for i in range(0, len(raw), size)], xy[:, [0, 0, 1, 1]]
     if not len(geometries):
         return [], np.empty((0, 4))
     if kind == "MULTIPOLYGON":
         return _encode_multipolygons(geometries, srs_id)
-    arrays = [np.asarray(vertices, "<f8") for vertices in geometries]
+    arrays = [xy.reshape(-1, 2) for xy in (np.asarray(vertices, "<f8") for vertices in geometries)]
     if kind == "POLYGON":
         arrays = [xy if np.array_equal(xy[0], xy[-1]) else np.vstack([xy, xy[:1]]) for xy in arrays]
     coords = np.concatenate(arrays)
     stops = np.cumsum([len(xy) for xy in arrays]).tolist()
     starts = [0, *stops[:-1]]
     bounds = np.stack([np.minimum.reduceat(coords, starts), np.maximum.reduceat(coords, starts)], axis=2).reshape(-1, 4)
-    raw = coords.tobytes()
-    head = struct.Struct("<BII" if kind == "LINESTRING" else "<BIII")
-    rings = () if kind == "LINESTRING" else (1,)
+    raw, n_counts = coords.tobytes(), ("POINT", "LINESTRING", "POLYGON").index(kind)  # rings, vertices
+    head = struct.Struct("<BI" + n_counts * "I")
     blobs = [
-        _HEADER.pack(b"GP\0\3", srs_id, *box)
-        + head.pack(1, _WKB_TYPES[kind], *rings, stop - start)
+        (_HEADER.pack(b"GP\0\3", srs_id, *box) if n_counts else struct.pack("<4si", b"GP\0\1", srs_id))
+        + head.pack(1, _WKB_TYPES[kind], *(1, stop - start)[2 - n_counts :])
         + raw[16 * start : 16 * stop]
         for start, stop, box in zip(starts, stops, bounds.tolist(), strict=True)
     ]
