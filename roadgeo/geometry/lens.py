@@ -71,12 +71,6 @@ class Lens:
         square = np.minimum((offset**2).sum(axis=-1, keepdims=True), self._farthest() ** 2)
         return np.asarray(self.center + self.half_side * offset * (1.0 + self.k1 * square))
 
-    def moves(self, points: FloatArray) -> FloatArray:
-        """Return the derivative (..., 2) of `straighten(points)` by k1."""
-        straight = (self.straighten(points) - self.center) / self.half_side
-        square = (straight**2).sum(axis=-1, keepdims=True)
-        return np.asarray(-self.half_side * straight * square / (1.0 + 3.0 * self.k1 * square))
-
     def _farthest(self) -> float:
         """Return the distance, as a pinhole sees it, up to which the lens does not fold over."""
         return math.inf if self.k1 >= 0.0 else _UNFOLDED / math.sqrt(-3.0 * self.k1)

@@ -123,7 +123,9 @@ class SeenCorners(NamedTuple):
     log_focal_sigma: float
 
 
-def fit_pinhole(starts: FloatArray, seen: SeenCorners) -> tuple[FloatArray, FloatArray] | None:
+def fit_pinhole(
+    starts: FloatArray, seen: SeenCorners, n_iterations: int = _STEPS
+) -> tuple[FloatArray, FloatArray] | None:
     """Fit a pinhole by Levenberg and Marquardt, from the start (S, 7) that is nearest; None where that fails.
 
     Return its parameters (7,) and their covariance (7, 7).
@@ -138,7 +140,7 @@ def fit_pinhole(starts: FloatArray, seen: SeenCorners) -> tuple[FloatArray, Floa
     p = starts[int(sums.argmin())]
     r, least, damping = off(p), float(sums.min()), 1e-3
     scale = np.array([math.exp(p[2] + p[6])] * 2 + [1.0] * 5)
-    for _ in range(_STEPS):
+    for _ in range(n_iterations):
         jacobian = _differentiate(off, p, scale)
         if not np.isfinite(jacobian).all():
             return None

@@ -28,7 +28,7 @@ def test_a_barrel_draws_corners_towards_the_middle_and_leaves_the_middle():
 
 
 @pytest.mark.parametrize("k1", [-0.15, 0.1])
-def test_directions_and_derivatives_are_those_of_small_steps(k1):
+def test_directions_are_those_of_small_steps(k1):
     lens = Lens.of(k1, SIZE)
     seen, _ = seen_points(lens)
     angles = np.random.default_rng(4).uniform(0, np.pi, len(seen))
@@ -36,8 +36,6 @@ def test_directions_and_derivatives_are_those_of_small_steps(k1):
     step = lens.straighten(seen + 1e-3 * directions) - lens.straighten(seen)
     turned = lens.straighten_directions(seen, directions)
     assert turned == pytest.approx(step / np.linalg.norm(step, axis=1, keepdims=True), abs=1e-5)
-    after = Lens.of(k1 + 1e-6, SIZE).straighten(seen)
-    assert lens.moves(seen) == pytest.approx((after - lens.straighten(seen)) / 1e-6, abs=1e-2, rel=1e-3)
 
 
 def test_nothing_is_seen_beyond_where_a_barrel_folds_over():
