@@ -8,6 +8,7 @@ import re
 import sys
 from enum import StrEnum
 from pathlib import Path
+from typing import ClassVar
 
 from roadgeo._text import visible
 
@@ -38,58 +39,6 @@ _BRINGS = {
         name: name for name in ("networkx", "onnxruntime", "osmium", "osmnx", "pyarrow", "requests", "scipy", "shapely")
     },
 }
-
-
-class RoadgeoError(Exception):
-    """Base of every error that roadgeo raises on purpose."""
-
-    def __str__(self) -> str:
-        """Return the message in one line, whatever names and files it quotes."""
-        return visible(super().__str__())
-
-
-class RoadSourceError(RoadgeoError):
-    """Roads could not be read, fetched, or are of no use (no lines, empty, unknown place, no network)."""
-
-
-class NoRoadsError(RoadSourceError):
-    """A source can be read and holds no roads."""
-
-
-class CrsError(RoadgeoError):
-    """A coordinate reference system is missing or cannot serve."""
-
-
-class MaskError(RoadgeoError):
-    """A query raster could not be read, or is not a road mask."""
-
-
-class PhotographError(MaskError):
-    """A query raster is a photograph: its roads have to be segmented first."""
-
-
-class ModelError(RoadgeoError):
-    """A segmentation model is missing, damaged, hostile, or not of a kind that can be run here."""
-
-
-class IndexFormatError(RoadgeoError):
-    """A reference's files are missing, damaged, hostile, stale or of another format version."""
-
-
-class NotLocatedError(RoadgeoError):
-    """A place was asked of a mask that was not located."""
-
-
-class MissingPackageError(RoadgeoError):
-    """A package is not installed."""
-
-
-class OutputError(RoadgeoError):
-    """A result could not be written."""
-
-
-class PluginError(RoadgeoError):
-    """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
 
 
 class Reason(StrEnum):
@@ -126,6 +75,68 @@ class Reason(StrEnum):
     MEMORY = "memory"
     #: The fault is roadgeo's own.
     FAULT = "fault"
+
+
+class RoadgeoError(Exception):
+    """Base of every error that roadgeo raises on purpose; `code` says for programs what it means of an image."""
+
+    code: ClassVar[Reason] = Reason.INVALID
+
+    def __str__(self) -> str:
+        """Return the message in one line, whatever names and files it quotes."""
+        return visible(super().__str__())
+
+
+class RoadSourceError(RoadgeoError):
+    """Roads could not be read, fetched, or are of no use (no lines, empty, unknown place, no network)."""
+
+
+class NoRoadsError(RoadSourceError):
+    """A source can be read and holds no roads."""
+
+
+class CrsError(RoadgeoError):
+    """A coordinate reference system is missing or cannot serve."""
+
+
+class MaskError(RoadgeoError):
+    """A query raster could not be read, or is not a road mask."""
+
+
+class PhotographError(MaskError):
+    """A query raster is a photograph: its roads have to be segmented first."""
+
+
+class ModelError(RoadgeoError):
+    """A segmentation model is missing, damaged, hostile, or not of a kind that can be run here."""
+
+    code = Reason.PLUGIN
+
+
+class IndexFormatError(RoadgeoError):
+    """A reference's files are missing, damaged, hostile, stale or of another format version."""
+
+    code = Reason.NO_REFERENCE
+
+
+class NotLocatedError(RoadgeoError):
+    """A place was asked of a mask that was not located."""
+
+
+class MissingPackageError(RoadgeoError):
+    """A package is not installed."""
+
+
+class OutputError(RoadgeoError):
+    """A result could not be written."""
+
+    code = Reason.NOT_WRITTEN
+
+
+class PluginError(RoadgeoError):
+    """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
+
+    code = Reason.PLUGIN
 
 
 def name_package(error: ModuleNotFoundError) -> MissingPackageError | None:

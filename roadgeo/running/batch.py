@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError, name_package
+from roadgeo.errors import IndexFormatError, Reason, RoadgeoError, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
@@ -181,14 +181,14 @@ class Locating:
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
-        return self.failed(task, "FAULT", reason)
+        return self.failed(task, Reason.FAULT, reason)
 
-    def failed(self, task: Task, code: str, reason: str) -> Outcome:
-        """Describe a failure, of which `code` is the name in `Reason`, with the keys of every other result."""
-        from roadgeo.location import Location, Reason
+    def failed(self, task: Task, code: Reason, reason: str) -> Outcome:
+        """Describe a failure with the keys of every other result."""
+        from roadgeo.location import Location
 
         location = Location(
-            task.query, "error", reason, options=self._changes(), command=self._command(task), reason_code=Reason[code]
+            task.query, "error", reason, options=self._changes(), command=self._command(task), reason_code=code
         )
         return Outcome("error", location.to_dict())
 
@@ -217,21 +217,22 @@ class Locating:
         try:
             return self.earlier(task, asked) or self._locate(task, asked, how)
         except RoadgeoError as error:
-            return self.failed(task, _code_of(error), str(error))
+            return self.failed(task, error.code, str(error))
         except UnicodeEncodeError:  # libraries take no other names
             reason = f"{task.query}: its name is no text, or the picture's; rename it"
-            return self.failed(task, "INVALID", reason)
+            return self.failed(task, Reason.INVALID, reason)
         except MemoryError:
             reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"
-            return self.failed(task, "MEMORY", reason)
+            return self.failed(task, Reason.MEMORY, reason)
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
             missing = name_package(error) if isinstance(error, ModuleNotFoundError) else None
             if missing is not None:
-                return self.failed(task, "INVALID", f"{task.query}: {missing}")
+                return self.failed(task, Reason.INVALID, f"{task.query}: {missing}")
             what = " ".join(f"{type(error).__name__}: {error}".split())
-            return self.failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
+            reason = f"{task.query}: {what}; this is a fault of roadgeo, please report it"
+            return self.failed(task, Reason.FAULT, reason)
 
     def earlier(self, task: Task, asked: Asked) -> Outcome | None:
         """Return the result of an earlier run, if it is whole, the answer to the same question, and younger than it.
@@ -351,19 +352,6 @@ def _changed(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, A
         name: _changed(value, usual[name]) if isinstance(value, dict) and isinstance(usual.get(name), dict) else value
         for name, value in changed.items()
     }
-
-
-#: Meaning of each kind of error for programs: names in `location.Reason`.
-_CODES = (
-    (IndexFormatError, "NO_REFERENCE"),
-    (OutputError, "NOT_WRITTEN"),
-    (ModelError, "PLUGIN"),
-    (PluginError, "PLUGIN"),
-)
-
-
-def _code_of(error: RoadgeoError) -> str:
-    return next((code for kind, code in _CODES if isinstance(error, kind)), "INVALID")
 
 
 def _on_ground(location: Location, dem: str) -> Camera | None:
