@@ -16,7 +16,7 @@ from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.triples import Sweep, TripleOptions
-from roadgeo.reference.inspection import reference_digest
+from roadgeo.reference.files import reference_digest
 from roadgeo.sources.roads import read_roads
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
