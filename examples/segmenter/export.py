@@ -43,6 +43,7 @@ METADATA = {
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
     "ways": 2,  # roadgeo's own key: shown each tile turned by half as well, the mean counts
+    "any_size": True,  # roadgeo's own: any tile does whose sides are multiples of 32; fixed in the file for GeoDeep
     "version": "6",
     "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel; painted scenes on "
     "streets of OpenStreetMap; encoder: ImageNet",

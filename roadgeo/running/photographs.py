@@ -66,6 +66,8 @@ class Look:
         How many times finer than that the photograph is shown.
     ways : int or None
         Number of ways in which a model sees it; None: the number on each model's card.
+    as_shown : bool
+        In one way, where it was shown at that scale already, but not at the next finer one.
     lower : bool
         At a threshold lower than the model's own.
     note : str
@@ -75,6 +77,7 @@ class Look:
     rank: int = 0
     finer: float = 1.0
     ways: int | None = None
+    as_shown: bool = False
     lower: bool = False
     note: str = ""
 
@@ -141,22 +144,21 @@ class Frame:
         return self._scales[rank]
 
     def looks(self) -> list[Look]:
-        """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best.
+        """Return the best scale's look, other scales, the photograph in more ways, and a lower threshold at the best.
 
         A model is shown it in one way first where that was done already, but not at the next finer scale, and where
         there is much to show. Where one scale is known, the two scales that were shown together are looked at alone
         as well.
         """
-        best, shown = self.scale(0), {scale for _, _, scale, _ in self._seen}
+        best = self.scale(0)
         has_models = bool(self.networks) and not self.masks.keys() >= set(self.paths)
-        was_shown = best in shown and not (self._may_be_finer(best) and _FINER * best in shown)
-        in_one = has_models and (was_shown or math.prod(self._shape_at(best)) > _MANY_PIXELS)
+        in_one = has_models and (self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS)
         has_more = has_models and (in_one or min(network.card.ways for network in self.networks.values()) < _WAYS)
         most = _WAYS if has_more else None
         looks = [Look(ways=1 if in_one else None)]
+        looks += [Look(rank, as_shown=True) for rank in range(1, self.n_scales)]
         if has_more:
             looks.append(Look(ways=most, note=f", shown {most} ways"))
-        looks += [Look(rank) for rank in range(1, self.n_scales)]
         if self.reading.threshold is None:
             looks.append(Look(ways=most, lower=True, note=", a lower threshold"))
         if has_models and not has_more and self.n_scales == 1 and self._may_be_finer(best):
@@ -172,7 +174,7 @@ class Frame:
             It shows no roads.
         """
         scale = look.finer * self.scale(look.rank)
-        seen = self.see(scale, look.ways)
+        seen = self.see(scale, 1 if look.as_shown and self._was_shown_alone(scale) else look.ways)
         threshold = seen.threshold if self.reading.threshold is None else self.reading.threshold
         return Seen(f"scale {scale:.3g}{look.note}", seen.mask(spread_probability(threshold)[look.lower]), seen)
 
@@ -204,6 +206,11 @@ class Frame:
             step = max(1, int(map_shape(photograph, scale)[0] / self.grid[0]))
             self._seen[key] = segment(photograph, network, scale, self.say, step=step, ways=ways)
         return self._seen[key]
+
+    def _was_shown_alone(self, scale: float) -> bool:
+        """Whether a model was shown the photograph at a scale, and not at the next finer one that it would go with."""
+        shown = {scale for _, _, scale, _ in self._seen}
+        return scale in shown and not (self._may_be_finer(scale) and _FINER * scale in shown)
 
     def _shape_at(self, scale: float) -> tuple[float, float]:
         """Return (H, W) of the photograph at a scale."""

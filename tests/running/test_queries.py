@@ -22,6 +22,7 @@ from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import _how_much_finer
 from roadgeo.running.queries import locate_query
 from roadgeo.sources.bands import PROBABILITY_TAG
+from roadgeo.sources.segmentation import scales
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import rank_scales
 from roadgeo.sources.segmentation.tiling import segment
@@ -160,9 +161,37 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
     monkeypatch.setattr(photographs, "locate_looks", take)
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
     locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenters=(str(model),)))
-    assert taken[:4] == ["0", "0, shown 2 ways", "1", "2"]
+    assert taken[:4] == ["0", "1", "2", "0, shown 2 ways"]
     # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
-    assert shown == [(1.0, 1), (1.0, 2), (2.0, 2)]
+    assert shown == [(1.0, 2), (2.0, 2), (1.0, 1)]
+
+
+def test_a_scale_that_is_known_alone_is_not_shown_finer_before_all_others(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was seen at the finest scale that is worth a look goes with the coarser one; a finer one would be dear."""
+    model = brightness_model(tmp_path / "light.onnx", size=256, props={"ways": 2})
+    shown: list[tuple[float, int]] = []
+    seen = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+
+    def note(
+        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
+    ) -> ProbabilityMap:
+        shown.append((scale, ways))
+        return seen
+
+    monkeypatch.setattr(photographs, "segment", note)
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: seen, 0.25: seen, 0.125: seen})
+    reading = ReadOptions(segment="always", segmenters=(str(model),))
+    with photographs.open_frame([str(photo)], reading, (0.0, np.inf), lambda *_: None) as frame:
+        looks = frame.looks()
+        for look in looks[: frame.n_scales]:
+            with suppress(MaskError):
+                frame.look(look)
+        assert not shown
+        with suppress(MaskError):
+            frame.look(looks[frame.n_scales])
+    assert shown == [(1.0, 1)]
 
 
 def test_a_photograph_is_located(
@@ -254,6 +283,7 @@ def test_no_scale_is_looked_for_in_vain(
 ) -> None:
     """Where the file states one it comes first; where none is known, what was seen on the way is taken."""
     calls = []
+    monkeypatch.setattr(scales, "_WHOLE_TILES", 4.0)  # no scale that may be the best is shown in part
     monkeypatch.setattr(photographs, "estimate_gsd", lambda _: stated)
     monkeypatch.setattr(photographs, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
     monkeypatch.setattr(

@@ -19,14 +19,15 @@ from typing import Any
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
 
-__all__ = ["MAX_WAYS", "ModelCard", "channels_come_last", "read_card", "size_of"]
+__all__ = ["MAX_WAYS", "TILE_STEP", "ModelCard", "channels_come_last", "read_card", "size_of"]
 
 #: Number of ways in which a tile can be shown to a model.
 MAX_WAYS = 4
 
 _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
+#: Free input sizes are made multiples of this, as encoders with five reductions ask for.
+TILE_STEP = 32
 _DEFAULT_TILE, _MAX_TILE = 512, 4096
-_TILE_STEP = 32  # free input sizes are made multiples of this, as encoders with five reductions ask for
 _MAX_SIDECAR = 4 << 20
 
 #: Numbers that a model may take, and those that it may give as probabilities or logits; whole ones may be classes.
@@ -45,6 +46,8 @@ class ModelCard:
         Metres per pixel that it was made for.
     tile : (height, width)
         Size of its input, pixels.
+    any_size : bool
+        Whether tiles may also be smaller, their sides multiples of `TILE_STEP`.
     kind : str
         Type of the numbers that it takes, as NumPy calls it; "uint8": RGB as it is, neither shifted nor scaled.
     channels_last : bool
@@ -69,6 +72,7 @@ class ModelCard:
 
     resolution_m: float | None
     tile: tuple[int, int]
+    any_size: bool
     kind: str
     channels_last: bool
     overlap: float
@@ -109,7 +113,7 @@ def _make_card(model: OnnxModel, metadata: dict[str, Any], class_name: str | Non
     kind = str(metadata.get("model_type", "Segmentor"))
     if kind.lower() != "segmentor":
         raise ModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
-    tile, channels_last = _tile_of(model, metadata)
+    tile, any_size, channels_last = _tile_of(model, metadata)
     names = metadata.get("classes", {})
     output = _choose_output(model, class_name)
     gives_classes = output.kind in _WHOLE and _n_channels(output) in (None, 1)
@@ -120,6 +124,7 @@ def _make_card(model: OnnxModel, metadata: dict[str, Any], class_name: str | Non
     card = ModelCard(
         resolution_m=resolution,
         tile=tile,
+        any_size=any_size,
         kind=model.inputs[0].kind,
         channels_last=channels_last,
         overlap=_within(metadata.get("overlap", 0.125), 0.0, 0.75, "overlap"),
@@ -139,8 +144,8 @@ def _make_card(model: OnnxModel, metadata: dict[str, Any], class_name: str | Non
     return replace(card, overlap=max(card.overlap, 0.05))
 
 
-def _tile_of(model: OnnxModel, metadata: dict[str, Any]) -> tuple[tuple[int, int], bool]:
-    """Return (height, width) of the input, its own where it is fixed, else as given; and whether channels come last."""
+def _tile_of(model: OnnxModel, metadata: dict[str, Any]) -> tuple[tuple[int, int], bool, bool]:
+    """Return (height, width) of the input, its own where fixed, else as given; if it is free; if channels are last."""
     if len(model.inputs) != 1:
         raise ModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
     port = model.inputs[0]
@@ -154,11 +159,11 @@ def _tile_of(model: OnnxModel, metadata: dict[str, Any]) -> tuple[tuple[int, int
         )
     sides = port.shape[1:3] if last else port.shape[2:]
     wanted = int(metadata.get("tile", _DEFAULT_TILE))
-    free = max(_TILE_STEP, round(wanted / _TILE_STEP) * _TILE_STEP)
+    free = max(TILE_STEP, round(wanted / TILE_STEP) * TILE_STEP)
     tile = sides[0] or free, sides[1] or free
-    if not all(_TILE_STEP <= side <= _MAX_TILE for side in tile):
-        raise ModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {_TILE_STEP} to {_MAX_TILE}")
-    return tile, last
+    if not all(TILE_STEP <= side <= _MAX_TILE for side in tile):
+        raise ModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {TILE_STEP} to {_MAX_TILE}")
+    return tile, not any(sides), last
 
 
 def _choose_output(model: OnnxModel, class_name: str | None) -> Port:

@@ -48,6 +48,11 @@ class Network:
     _size: tuple[int, int] | None = field(default=None, repr=False)  # of its output
 
     @property
+    def any_size(self) -> bool:
+        """Whether tiles may be smaller than the card's, and all of each is visible."""
+        return self.card.any_size and self.seen == self._size == self.card.tile
+
+    @property
     def margin(self) -> tuple[int, int]:
         """Rows above and columns to the left of the visible part of a tile."""
         (height, width), (rows, columns) = self.card.tile, self.seen
@@ -59,18 +64,19 @@ class Network:
         Parameters
         ----------
         tile : (H, W, 3) uint8
-            RGB, of the model's own size.
+            RGB, of the model's own size, or of a smaller one where it takes any.
 
         Returns
         -------
         (rows, columns) float32
-            Probabilities, of the size `seen`.
+            Probabilities, of the size `seen`, or of the tile's.
         """
         road = self._to_probability(self._run(tile))
-        if road.shape != self._size:
-            raise ModelError(f"{self.name}: gives {road.shape[::-1]} pixels, before {self._size}; expected one size")
-        if road.shape != self.seen:
-            road = np.asarray(cv2.resize(road, self.seen[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+        size, seen = (tile.shape[:2], tile.shape[:2]) if self.any_size else (self._size, self.seen)
+        if road.shape != size:
+            raise ModelError(f"{self.name}: gives {road.shape[::-1]} pixels, before {size}; expected one size")
+        if road.shape != seen:
+            road = np.asarray(cv2.resize(road, seen[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         return road
 
     def _run(self, tile: AnyArray) -> Float32Array:

@@ -33,11 +33,24 @@ _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 _ORT = b"ORTM"  # where the file of another format has it, which onnxruntime would read instead
 _STRING = 8  # of TensorProto.DataType
+_ANY_SIZE = b"any_size"  # a key of our own in the metadata, for GeoDeep wants an input of a fixed size
 
 #: The checked parts of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
 _SCHEMA = (
-    ("Model", (("version", 1, "int64"), ("graph", 7, "Graph"), ("training", 20, "bytes"), ("function", 25, "bytes"))),
-    ("Graph", (("node", 1, "Node"), ("stored", 5, "Tensor"), ("sparse", 15, "bytes"))),
+    (
+        "Model",
+        (
+            *(("version", 1, "int64"), ("graph", 7, "Graph"), ("metadata", 14, "Entry"), ("training", 20, "bytes")),
+            ("function", 25, "bytes"),
+        ),
+    ),
+    ("Graph", (("node", 1, "Node"), ("stored", 5, "Tensor"), ("input", 11, "Value"), ("sparse", 15, "bytes"))),
+    ("Entry", (("key", 1, "bytes"), ("value", 2, "bytes"))),
+    ("Value", (("type", 2, "Type"),)),
+    ("Type", (("tensor", 1, "Numbers"),)),
+    ("Numbers", (("shape", 2, "Shape"),)),
+    ("Shape", (("side", 1, "Side"),)),
+    ("Side", (("length", 1, "int64"),)),
     ("Node", (("output", 2, "bytes"), ("operator", 4, "bytes"), ("attribute", 5, "Attribute"), ("domain", 7, "bytes"))),
     (
         "Attribute",
@@ -135,9 +148,14 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     if len(content) > _MAX_BYTES:
         raise ModelError(f"{name}: too large; expected a model of {_MAX_BYTES >> 20} MB at most")
     try:
-        last = _require_network(content)
+        model = _require_network(content)
     except ModelError as error:
         raise ModelError(f"{name}: {error}") from error
+    last = {
+        _text(output): _text(name) for node in model.graph[0].node for output in node.output for name in node.operator
+    }
+    content = _of_any_size(model) or content
+    del model  # as large as the file
     try:
         session = _open_session(content, threads)
         inputs, outputs = (tuple(map(_port, some)) for some in (session.get_inputs(), session.get_outputs()))
@@ -149,8 +167,8 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     return OnnxModel(name, inputs, outputs, last, metadata, session)
 
 
-def _require_network(content: bytes) -> dict[str, str]:
-    """Look through a ModelProto; return the operator that makes each value."""
+def _require_network(content: bytes) -> Any:
+    """Look through a ModelProto, and return it."""
     from google.protobuf.message import DecodeError
 
     if content[4:8] == _ORT:
@@ -172,7 +190,18 @@ def _require_network(content: bytes) -> dict[str, str]:
     _require_numbers(graph.stored)
     for node in graph.node:
         _require_plain(node)
-    return {_text(output): _text(name) for node in graph.node for output in node.output for name in node.operator}
+    return model
+
+
+def _of_any_size(model: Any) -> bytes:
+    """Return a file whose metadata say that its input may be of any size, with such an input; nothing of any other."""
+    if not any(_ANY_SIZE in entry.key and b"true" in entry.value for entry in model.metadata):
+        return b""
+    kinds = (kind for port in model.graph[0].input for kind in port.type)
+    for shape in (shape for kind in kinds for numbers in kind.tensor for shape in numbers.shape):
+        for side in shape.side[2:]:
+            side.ClearField("length")
+    return bytes(model.SerializeToString())
 
 
 def _require_plain(node: Any) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError
+from roadgeo.sources.segmentation.card import TILE_STEP
 from roadgeo.sources.segmentation.network import Network
 from roadgeo.sources.segmentation.photograph import Photograph, find_ground, is_plain
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap
@@ -81,7 +82,7 @@ def segment(
         y_scale = photograph.height / shape[0]
         return photograph.read(0.0, top * y_scale, float(photograph.width), rows * y_scale, (rows, shape[1]))[0]
 
-    seen = _Seen(network.seen, network.margin, network.card.tile, network.card.overlap)
+    seen = _seen(network, shape)
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
     done, rest = 0, np.empty((0, shape[1]), np.float32)
@@ -120,6 +121,21 @@ class _Seen(NamedTuple):
     margin: tuple[int, int]
     tile: tuple[int, int]
     overlap: float
+
+
+def _seen(network: Network, shape: tuple[int, int]) -> _Seen:
+    """Return the tiles of a picture of (H, W) pixels: of free size, no more than else, and no larger than they need."""
+    tile, overlap = network.card.tile, network.card.overlap
+    if not network.any_size:
+        return _Seen(network.seen, network.margin, tile, overlap)
+    height, width = (_least(length, side, overlap) for length, side in zip(shape, tile, strict=True))
+    return _Seen((height, width), (0, 0), (height, width), overlap)
+
+
+def _least(length: int, tile: int, overlap: float) -> int:
+    """Return the least side of as many tiles as cover a length with ones of side `tile`."""
+    side = length / (1 + (len(_starts(length, tile, overlap)) - 1) * (1 - overlap))
+    return min(tile, TILE_STEP * math.ceil(side / TILE_STEP))
 
 
 def _blend(
