@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import OTHERS, Command, each, n_threads, row, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.options import OTHERS, Command, each, n_threads, open_maps, row, take
+from roadgeo.cli.printing import echo, is_set
 from roadgeo.matching.hints import HINTS
 
 if TYPE_CHECKING:
@@ -114,26 +114,22 @@ def serve_command(
     references: tuple[str, ...],
     mavlink: str | None,
     no_browser: bool,
-    quiet: bool,
     **given: Any,
 ) -> int:
     """Keep references open, and answer; for the help see above."""
-    from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.progress import print_steps
     from roadgeo.errors import OutputError, RoadgeoError
     from roadgeo.flights.mavlink import MavlinkSender
-    from roadgeo.running.batch import open_references
+    from roadgeo.serving.app import Service
     from roadgeo.serving.server import Server
     from roadgeo.serving.workers import Workers
 
     # Compiled and opened here first: errors in the references are printed before anything listens.
     options = _options(given)
-    compile_once(quiet)
-    maps = open_references(references, print_steps(quiet))
+    maps = open_maps(references)
     workers = Workers(references, options.workers, options.waiting, n_threads(options.workers))
     try:
         sender = None if mavlink is None else MavlinkSender(mavlink)
-        server = Server(workers, maps, options, None if sender is None else partial(_tell, sender))
+        server = Server(Service(workers, maps, options, None if sender is None else partial(_tell, sender)))
     except RoadgeoError:
         workers.close()
         raise
@@ -149,7 +145,7 @@ def serve_command(
     if not no_browser and _has_screen():
         threading.Timer(0.5, webbrowser.open, [address]).start()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    _log(quiet)
+    _log()
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -181,12 +177,12 @@ class _Log(logging.Handler):
             return
 
 
-def _log(quiet: bool) -> None:
-    """Have faults written to stderr, and unless `quiet` a line for each request: client, request, status."""
+def _log() -> None:
+    """Have faults written to stderr, and unless --quiet a line for each request: client, request, status."""
     log = _Log()
     log.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     logging.getLogger().addHandler(log)
-    if not quiet:
+    if not is_set("quiet"):
         logging.getLogger("uvicorn.access").setLevel(logging.INFO)
 
 

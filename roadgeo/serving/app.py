@@ -48,7 +48,7 @@ Listener = Callable[[dict[str, Any], float], None]
 
 
 class Service:
-    """The routes, and their shared state.
+    """The routes, and their shared state; `listener` is called with each place that is found.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Service:
         options: ServeOptions,
         listener: Listener | None = None,
     ) -> None:
-        self._workers, self._options, self._listener = workers, options, listener
+        self.workers, self.options, self._listener = workers, options, listener
         self._jobs, self._tiles = Jobs(workers.folder, options), Tiles(references)
         self._threads = ThreadPoolExecutor(options.workers + options.waiting + 4)
         self._drawing = ThreadPoolExecutor(1)  # whatever maps are looked at, the rest of the machine searches
@@ -104,13 +104,13 @@ class Service:
     async def _locate(self, request: Request) -> Response:
         """Locate an image at once, or as a job where its sender prefers not to wait."""
         came = time.time()
-        with self._workers.take_place():
+        with self.workers.take_place():
             pass  # whoever comes when it is full need not send an image first; who sends one slowly holds no place
         with self._jobs.room() as folder:
             job = await _take(request, folder)
             if "respond-async" in request.headers.get("prefer", "").lower():
                 return self._start(job, came, f"jobs/{job.id}")
-            with self._workers.take_place():
+            with self.workers.take_place():
                 answer = await self._ask(job, came)
         return _respond(answer, answer.document)
 
@@ -126,21 +126,21 @@ class Service:
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
         """Have a process locate an image, and report its place to the listener."""
         loop, hints = asyncio.get_running_loop(), dict(job.hints)
-        limit = min(hints.pop(LIMIT, self._options.time_limit_s), self._options.time_limit_s)
-        asked = Asked(str(job.path), hints, limit, self._options.max_pixels, job.name, keeps)
+        limit = min(hints.pop(LIMIT, self.options.time_limit_s), self.options.time_limit_s)
+        asked = Asked(str(job.path), hints, limit, self.options.max_pixels, job.name, keeps)
 
         def say(text: str, share: float | None = None) -> None:
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(job.tell, text, share)
 
-        answer = await loop.run_in_executor(self._threads, self._workers.ask, asked, say, job.called_off)
+        answer = await loop.run_in_executor(self._threads, self.workers.ask, asked, say, job.called_off)
         if answer.status == 200 and self._listener is not None:
             await loop.run_in_executor(self._threads, _report, self._listener, answer.document, came)
         return answer
 
     def _start(self, job: Job, came: float, location: str) -> Response:
         """Locate while nobody waits."""
-        place = self._workers.take_place()
+        place = self.workers.take_place()
         self._jobs.add(job)
         task = asyncio.get_running_loop().create_task(self._work(job, place, came))
         self._tasks.add(task)
@@ -213,9 +213,9 @@ class Service:
         job, name = self._find(request), request.path_params["name"]
         if name not in OFFERED or job.status != "successful":
             raise HTTPException(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
-        asked = Asked(str(job.path), {}, _WRITE_S, self._options.max_pixels, wanted=name)
-        with self._workers.take_place():
-            answer = await asyncio.get_running_loop().run_in_executor(self._threads, self._workers.ask, asked)
+        asked = Asked(str(job.path), {}, _WRITE_S, self.options.max_pixels, wanted=name)
+        with self.workers.take_place():
+            answer = await asyncio.get_running_loop().run_in_executor(self._threads, self.workers.ask, asked)
         if answer.status >= 400:
             return _respond(answer, {})
         path = Path(answer.document["file"])
@@ -238,7 +238,7 @@ class Service:
 
     async def _open_session(self, request: Request) -> Response:
         """Give a browser a pass for the token that its user typed, once."""
-        given, token = (await request.body()).decode("utf-8", "replace").strip(), self._options.token
+        given, token = (await request.body()).decode("utf-8", "replace").strip(), self.options.token
         if token and not is_same(given, token):
             raise HTTPException(401, "this is not the token")
         response = JSONResponse({"status": "ok"})
@@ -248,8 +248,8 @@ class Service:
 
     async def _references(self, _: Request) -> Response:
         references = await asyncio.get_running_loop().run_in_executor(self._drawing, self._tiles.describe)
-        limits = {"max_bytes": self._options.max_bytes, "kept": self._options.kept_jobs, "max_zoom": MAX_ZOOM}
-        basemap = {"basemap": self._options.basemap, "basemap_attribution": self._options.basemap_attribution}
+        limits = {"max_bytes": self.options.max_bytes, "kept": self.options.kept_jobs, "max_zoom": MAX_ZOOM}
+        basemap = {"basemap": self.options.basemap, "basemap_attribution": self.options.basemap_attribution}
         return JSONResponse({"references": references, **limits, **basemap})
 
     async def _tile(self, request: Request) -> Response:

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Sequence
 
 import uvicorn
 
 from roadgeo import __version__
-from roadgeo.reference.reference import AnyReference
-from roadgeo.serving.app import Listener, Service
-from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.app import Service
 from roadgeo.serving.workers import Workers
 
 __all__ = ["Server"]
@@ -35,27 +32,22 @@ class Server:
         Where it listens.
     """
 
-    def __init__(
-        self,
-        workers: Workers,
-        references: Sequence[AnyReference],
-        options: ServeOptions,
-        listener: Listener | None = None,
-    ) -> None:
-        """Listen on a port; `listener` is called with each place that is found.
+    def __init__(self, service: Service) -> None:
+        """Listen on a port.
 
         Raises
         ------
         OSError
             It cannot listen there.
         """
-        self._workers = workers
-        self._socket = _listen(options.host, options.port)
+        host = service.options.host
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._service = service
+        self._socket = socket.create_server((host, service.options.port), family=family, backlog=128)
         self.server_address = self._socket.getsockname()
         self.server_port: int = self.server_address[1]
-        self._service = Service(workers, references, options, listener)
         config = uvicorn.Config(
-            self._service.app,
+            service.app,
             http="h11",
             ws="none",
             lifespan="off",
@@ -63,12 +55,12 @@ class Server:
             server_header=False,
             headers=[("Server", f"roadgeo/{__version__}")],
             proxy_headers=False,
-            limit_concurrency=options.connections,
+            limit_concurrency=service.options.connections,
             timeout_keep_alive=_IDLE_S,
             h11_max_incomplete_event_size=_HEAD_BYTES,
             timeout_graceful_shutdown=_FAREWELL_S,
         )
-        self._uvicorn = _Uvicorn(config, workers)
+        self._uvicorn = _Uvicorn(config, service.workers)
 
     def serve_forever(self) -> None:
         """Answer until a signal ends it, or `shutdown`.
@@ -87,7 +79,7 @@ class Server:
     def close(self) -> None:
         """Stop listening and end the processes."""
         self._socket.close()
-        self._workers.close()
+        self._service.workers.close()
         self._service.close()
 
 
@@ -102,8 +94,3 @@ class _Uvicorn(uvicorn.Server):
         """End."""
         await asyncio.to_thread(self._workers.close)
         await super().shutdown(sockets)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return socket.create_server((host, port), family=family, backlog=128)

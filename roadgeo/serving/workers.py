@@ -210,7 +210,7 @@ class _Worker:
         OSError
             The system has no room for it.
         """
-        self._is_open = False
+        self._opened: Answer | None = None
         self._pipe, theirs = self._context.Pipe()
         try:
             process = self._context.Process(target=_serve, args=(theirs, *self._given), daemon=True)
@@ -231,14 +231,14 @@ class _Worker:
         from roadgeo.errors import IndexFormatError
 
         try:
-            why = self._open()
+            self._opened = self._hear(_START_S)
         except (EOFError, OSError):
-            why = "a process of the server ended while it opened the references"
-        if why:
-            raise IndexFormatError(why)
+            self._opened = Answer(503, {"detail": "a process of the server ended while it opened the references"})
+        if self._opened.status != 200:
+            raise IndexFormatError(self._opened.document["detail"])
 
     def ask(self, asked: Asked, say: Say, called_off: threading.Event) -> Answer:
-        """Return its answer.
+        """Return its answer; of a fresh process whose references cannot be opened, the reason.
 
         Raises
         ------
@@ -249,31 +249,24 @@ class _Worker:
         EOFError, OSError
             The process has ended.
         """
-        if why := self._open():
-            return Answer(503, {"detail": why})
+        self._opened = self._opened or self._hear(_START_S)
+        if self._opened.status != 200:
+            return self._opened
         self._pipe.send(asked)
-        patience_s = asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S)
+        return self._hear(asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S), say, called_off)
+
+    def _hear(self, patience_s: float, say: Say = say_nothing, called_off: threading.Event | None = None) -> Answer:
+        """Wait for an answer, the first of which is whether the references are open, and pass the progress on."""
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
-            if called_off.is_set():
+            if called_off is not None and called_off.is_set():
                 raise CalledOff
             if self._pipe.poll(min(_GLANCE_S, patience_s)):
-                message = self._pipe.recv()  # an answer, or the progress
+                message = self._pipe.recv()
                 if isinstance(message, Answer):
                     return message
                 say(*message)
         raise TimeoutError(f"longer than {patience_s:g} s")
-
-    def _open(self) -> str:
-        """Wait until a fresh process has opened its references; return why it cannot, "" where it can."""
-        said = self._is_open or self._receive(_START_S)
-        self._is_open = said is True
-        return "" if self._is_open else str(said)
-
-    def _receive(self, patience_s: float) -> Any:
-        if not self._pipe.poll(patience_s):
-            raise TimeoutError(f"longer than {patience_s:g} s")
-        return self._pipe.recv()
 
     def end(self) -> None:
         """End the process."""
@@ -303,9 +296,9 @@ def _serve(pipe: Connection, names: list[str], threads: int, folder: Path) -> No
         with suppress(ModelError):  # masks are located without it
             load_model("", None, threads)
     except RoadgeoError as error:
-        pipe.send(str(error))
+        pipe.send(Answer(503, {"detail": str(error)}))
         return
-    pipe.send(True)
+    pipe.send(Answer(200, {}))
     try:
         while True:
             asked: Asked = pipe.recv()

@@ -22,6 +22,7 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place, Reason
 from roadgeo.reference.reference import Reference
+from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
 from roadgeo.serving.workers import Full, _answer
@@ -79,7 +80,7 @@ def served(town, tmp_path_factory):
 
 def serving(workers, references=None, **options):
     options = ServeOptions(port=0, workers=2, waiting=4, **options)
-    return running(Server(workers, references or workers.references, options))
+    return running(Server(Service(workers, references or workers.references, options)))
 
 
 @pytest.fixture(scope="module")

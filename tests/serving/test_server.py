@@ -23,6 +23,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Sighting
+from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
 from roadgeo.serving.workers import Answer, Full, _answer
@@ -63,9 +64,8 @@ class Workers:
 
 
 def serving(workers=None, listener=None, **options):
-    return running(
-        Server(workers or Workers(), [SimpleNamespace(name="town")], ServeOptions(port=0, **options), listener)
-    )
+    options = ServeOptions(port=0, **options)
+    return running(Server(Service(workers or Workers(), [SimpleNamespace(name="town")], options, listener)))
 
 
 @contextmanager
@@ -534,7 +534,7 @@ def test_a_job_that_fails_says_why():
         assert wait_for(server, job, "failed")["message"] == "the image: no road in it"
         answer, document = ask(server, "GET", f"/jobs/{job}/results")
         assert (answer.status, document["detail"]) == (422, "the image: no road in it")
-        assert not list(server._workers.folder.iterdir())  # of what failed nothing is kept on disk
+        assert not list(server._service.workers.folder.iterdir())  # of what failed nothing is kept on disk
 
 
 def test_a_job_is_called_off_and_forgotten():
@@ -551,7 +551,7 @@ def test_a_job_is_called_off_and_forgotten():
             time.sleep(0.02)
         workers.busy.set()
         assert ask(server, "POST", "/locate", PNG)[0].status == 200
-        assert not list(server._workers.folder.iterdir())
+        assert not list(server._service.workers.folder.iterdir())
 
 
 def test_the_latest_answers_are_kept():
@@ -559,14 +559,14 @@ def test_the_latest_answers_are_kept():
         jobs = [finished(server) for _ in range(4)]
         there = [ask(server, "GET", f"/jobs/{job}")[0].status for job in jobs]
         assert there == [404, 404, 200, 200]
-        assert len(list(server._workers.folder.iterdir())) == 2
+        assert len(list(server._service.workers.folder.iterdir())) == 2
 
 
 def test_nothing_of_a_request_is_kept():
     with serving() as server:
         for body in (PNG, b"no image", PNG + bytes(100_000)):
             ask(server, "POST", "/locate", body)
-        assert not list(server._workers.folder.iterdir())
+        assert not list(server._service.workers.folder.iterdir())
 
 
 def test_other_sites_get_nothing():
@@ -697,5 +697,5 @@ def test_names_of_senders_lead_nowhere(name):
     body, headers = form((b'name="image"; filename="%b"' % name.encode(), PNG))
     with serving(workers) as server:
         assert ask(server, "POST", "/locate", body, headers)[0].status == 200
-        assert Path(workers.asked[0].path).parents[2] == server._workers.folder
+        assert Path(workers.asked[0].path).parents[2] == server._service.workers.folder
         assert len(Path(workers.asked[0].path).name) < 60

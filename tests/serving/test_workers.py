@@ -115,7 +115,7 @@ def test_what_a_process_answers(place, tmp_path, monkeypatch):
         Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
     ]
     ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch, tmp_path)
-    assert ready is True
+    assert ready.status == 200
     assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
     assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
     assert (small.status, small.document["detail"][:15]) == (413, "900 x 900 pixel")
@@ -139,7 +139,8 @@ def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatc
 
 def test_a_process_that_cannot_open_its_references_says_so(tmp_path, monkeypatch):
     (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch, tmp_path)
-    assert "nonesuch.gpkg" in said
+    assert said.status == 503
+    assert "nonesuch.gpkg" in said.document["detail"]
 
 
 def test_a_port_that_is_taken_is_said(place, capsys):
