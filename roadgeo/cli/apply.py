@@ -8,7 +8,7 @@ import click
 
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.options import OTHERS, Command, Plugin, each, out_dir_option, row, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, tell
 from roadgeo.outputs.registry import offered
 from roadgeo.storage.files import make_folder
 
@@ -32,7 +32,7 @@ _OPTIONS = (
 @click.argument("location", metavar="LOCATION.json", type=click.Path())
 @click.argument("pictures", metavar="PICTURE...", nargs=-1, required=True, type=click.Path())
 @each(_OPTIONS)
-def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet: bool, **given: Any) -> int:
+def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, **given: Any) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
 
     LOCATION.json is written by `roadgeo locate`. A PICTURE is another scan, band, exposure or analysis of the same
@@ -60,8 +60,6 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet:
     make_folder(out_dir)
     image = ImageOptions(given["crs"], given["resolution"], given["resampling"], compression=given["compression"])
     for path in apply_location(place, pictures, out_dir, image, given["products"], given["stretch"]):
-        if not quiet:
-            echo(f"wrote {path}")
-    if not quiet:
-        tell_accuracy([place.to_dict()], given["crs"])
+        tell(f"wrote {path}")
+    tell_accuracy([place.to_dict()], given["crs"])
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["compile_once"]
 
 
-def compile_once(quiet: bool, map_only: bool = False) -> None:
+def compile_once(map_only: bool = False) -> None:
     """Make the kernels ready; where they were not compiled yet, show that on standard error.
 
     A map alone needs half of them.
@@ -13,5 +13,5 @@ def compile_once(quiet: bool, map_only: bool = False) -> None:
     from roadgeo.cli.progress import show_steps
     from roadgeo.kernels.warmup import warm_up
 
-    with show_steps(quiet) as say:
+    with show_steps() as say:
         warm_up(say, map_only)

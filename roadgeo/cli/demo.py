@@ -10,7 +10,7 @@ import click
 
 from roadgeo.cli import ERROR
 from roadgeo.cli.options import out_dir_option
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import complain, echo
 from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def demo_command(out_dir: str) -> int:
     sources = [(path, path.name) for path in (ROADS, STREETS, PHOTO, photo.path)]
     for source, name in [*sources, *((mask.path, f"masks/{mask.path.name}") for mask in masks)]:
         write_bytes(folder / name, source.read_bytes())
-    compile_once(quiet=False, map_only=True)
+    compile_once(map_only=True)
     for roads, name, attribution in ((STREETS, "berkeley", STREETS_ATTRIBUTION), (ROADS, "porto", ATTRIBUTION)):
         started = perf_counter()
         path = folder / f"{name}.gpkg"
@@ -71,7 +71,7 @@ def demo_command(out_dir: str) -> int:
         )
         seconds = perf_counter() - started
         echo(f"{name.title()}, {attribution}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
-    compile_once(quiet=False)
+    compile_once()
     # each result is judged as soon as it is there
     berkeley, porto = (str(folder / f"{name}.gpkg") for name in ("berkeley", "porto"))
     wrong = 0
@@ -94,7 +94,7 @@ def demo_command(out_dir: str) -> int:
         ' "Your town"`, once; then `roadgeo locate photo.jpg --report`.'
     )
     if wrong:
-        echo(f"Error: {wrong} results came out wrong; please report it", err=True)
+        complain(f"{wrong} results came out wrong; please report it")
     return ERROR if wrong else 0
 
 

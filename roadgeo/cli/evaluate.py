@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +16,7 @@ from click.core import ParameterSource
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.options import OTHERS, Command, each, hinted, make_options, out_dir_option, row, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, is_set, tell
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
 
@@ -50,7 +49,7 @@ _OPTIONS = (
         "With --map: try N other masks and count those located in each class.",
         type=click.IntRange(0), default=0, rare=True),
     out_dir_option("Write here, and go on from here.", None, Path),
-    row("--json as_json", "", OTHERS, "Print the figures as one JSON object."),
+    take("json", help="Print the figures as one JSON object."),
     take("quiet"),
 )  # fmt: skip
 
@@ -69,8 +68,6 @@ def evaluate_command(
     height: float | None,
     check: int,
     out_dir: Path | None,
-    as_json: bool,
-    quiet: bool,
     **options: Any,
 ) -> None:
     """Locate masks whose place is known, and count.
@@ -102,7 +99,7 @@ def evaluate_command(
         make_folder(out_dir)
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
-    compile_once(quiet)
+    compile_once()
     hints = hinted(options)
     locator = ReferenceLocator((path,), make_options(hints, method))
     options = {name: value for name, value in options.items() if name not in _HINTED}
@@ -110,12 +107,12 @@ def evaluate_command(
     about = {"reference": path.stem, "method": method, **known}
     if as_map:
         survey = _survey(locator, options, about)
-        survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=partial(count_up, quiet=quiet))
-        _write_map(survey, as_json, quiet)
+        survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=count_up)
+        _write_map(survey)
         return
     query_set, settings = _query_set(path, queries, roads, options)
     settings |= about
-    _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+    _evaluate(query_set, locator, settings, radius, jobs, out_dir)
 
 
 #: Names of the search's hints in the settings of an evaluation.
@@ -167,8 +164,6 @@ def _evaluate(
     radius: float,
     jobs: int,
     out_dir: Path | None,
-    as_json: bool,
-    quiet: bool,
 ) -> None:
     """Locate all queries; write and print what that shows."""
     from roadgeo.evaluation.scoring import evaluate
@@ -179,7 +174,7 @@ def _evaluate(
     before = _recorded(record)
     started = time.perf_counter()
     try:
-        with count_up(len(queries), quiet) as count:
+        with count_up(len(queries)) as count:
             trials = run_trials(queries, locator, jobs, record, settings, count)
     except KeyboardInterrupt:
         if record is not None:
@@ -200,9 +195,9 @@ def _evaluate(
         write_text(out_dir / "masks.csv", masks_to_csv(evaluation))
         page = render_report(evaluation, truths, title, _maps_of(locator, truths))
         write_text(out_dir / "report.html", page)
-    if as_json:
+    if is_set("as_json"):
         echo(json.dumps({name: part for name, part in document.items() if name != "scores"}))
-    elif not quiet:
+    elif not is_set("quiet"):
         _print(evaluation)
         earlier = f" ({before} of them recorded before)" if before else ""
         where = f"; see {out_dir}" if out_dir else ""
@@ -255,27 +250,25 @@ def _query_set(
     return MaskFiles(table.parent, tuple(truths)), {"queries": str(queries)}
 
 
-def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
+def _write_map(survey: Survey) -> None:
     """Make the map of localizability; print how much of it promises what."""
     from roadgeo.evaluation.survey import write_survey
 
     summary, files = write_survey(survey, survey.out_dir or Path(), _made_of(survey.locator))
-    if as_json:
+    if is_set("as_json"):
         echo(json.dumps(summary))
-        return
-    if quiet:
         return
     for entry in summary["classes"]:
         line = f"{entry['label']:<28} {100 * entry['area_share']:5.1f} % of the map"
         if entry["located"]:
             line += f"; located there: {entry['located']['hits']} of {entry['located']['of']}"
-        echo(line)
+        tell(line)
     if not summary["classes"][0]["area_share"]:
-        echo(
+        tell(
             "No promise can be made anywhere: too few masks were located, or tried; a larger -n, wider windows or"
             " better masks may help."
         )
-    echo(f"wrote {files[0]}, {', '.join(path.suffix for path in files[1:])}", err=True)
+    tell(f"wrote {files[0]}, {', '.join(path.suffix for path in files[1:])}", err=True)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------

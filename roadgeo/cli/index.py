@@ -12,8 +12,8 @@ import click
 from roadgeo._progress import Say
 from roadgeo._text import counted
 from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, row, take
-from roadgeo.cli.printing import echo
-from roadgeo.cli.shards import build_in_shards, shard_options
+from roadgeo.cli.printing import echo, is_set, tell
+from roadgeo.cli.shards import build_in_shards, shard_options, tell_built
 
 if TYPE_CHECKING:
     from roadgeo.sources.roads import Roads
@@ -65,8 +65,6 @@ def index_command(
     replace: bool,
     rebuild: str | None,
     shards: dict[str, Any] | None,
-    quiet: bool,
-    verbose: bool,
     **source: Any,
 ) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
@@ -99,7 +97,7 @@ def index_command(
     if rebuild is not None:
         if replace or coarse or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
             raise click.UsageError("--rebuild takes nothing but the reference: its roads are in its GeoPackage.")
-        _rebuild(rebuild, quiet)
+        _rebuild(rebuild)
         return
     given = _one_source(source)
     if coarse:
@@ -108,25 +106,22 @@ def index_command(
         _require_geopackage(out)
     name = name or _name(source, given, out)
     if shards is not None:
-        build_in_shards(source, name, out, shards, quiet)
+        build_in_shards(source, name, out, shards)
         return
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
     if not replace:
         _keep_or_replace(path)
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
-    with show_steps(quiet) as say:
+    with show_steps() as say:
         roads = read(source, given, say)
-    compile_once(quiet, map_only=True)  # nobody waits for that whose roads cannot be read
-    with show_steps(quiet) as say:
+    compile_once(map_only=True)  # nobody waits for that whose roads cannot be read
+    with show_steps() as say:
         reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
-    if verbose:
+    if is_set("verbose"):
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)
-    if not quiet:
-        seconds = perf_counter() - started
-        found = f"{path}: {counted(len(reference.index), 'intersection')} in {seconds:.1f} s"
-        echo(f"{found}; search it with `roadgeo locate photo.jpg -r {out or path.stem}`")
+    tell_built(f"{path}: {counted(len(reference.index), 'intersection')}", started, out or path.stem)
 
 
 def _kinds_of_coarse(in_shards: bool) -> str:
@@ -173,18 +168,17 @@ def _keep_or_replace(path: Path) -> None:
     click.confirm(f"There is a reference {path.stem} of {known}. Replace it?", abort=True, err=True)
 
 
-def _rebuild(name: str, quiet: bool) -> None:
+def _rebuild(name: str) -> None:
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import show_steps
     from roadgeo.reference.library import resolve_whole
     from roadgeo.reference.reference import rebuild_reference
 
     path = resolve_whole(name)
-    compile_once(quiet, map_only=True)
-    with show_steps(quiet) as say:
+    compile_once(map_only=True)
+    with show_steps() as say:
         reference = rebuild_reference(path, say)
-    if not quiet:
-        echo(f"{path}: {counted(len(reference.index), 'intersection')} indexed again")
+    tell(f"{path}: {counted(len(reference.index), 'intersection')} indexed again")
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------

@@ -6,12 +6,14 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo._progress import say_nothing
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
@@ -24,16 +26,17 @@ from roadgeo.cli.options import (
     Command,
     Plugin,
     each,
+    find_tasks,
     hinted,
     make_cluster,
     make_options,
+    open_maps,
     out_dir_option,
     read_options,
-    refuse_swapped,
     row,
     take,
 )
-from roadgeo.cli.printing import echo, paint
+from roadgeo.cli.printing import complain, echo, is_set, paint, tell
 from roadgeo.cli.truths import read_truths
 from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import (
@@ -43,16 +46,16 @@ from roadgeo.outputs.registry import (
     EXPLANATION_PICTURE,
     GCPS,
     OVERLAY,
+    REGISTRY,
     REPORT,
     Output,
     offered,
 )
 from roadgeo.outputs.wording import format_lonlat
-from roadgeo.running.batch import Outcome, locate_masks, open_references, write_overview
+from roadgeo.running.batch import Outcome, locate_masks, write_overview
 from roadgeo.running.options import BatchOptions
-from roadgeo.running.tasks import SUFFIXES, find_masks, name_tasks
+from roadgeo.running.tasks import SUFFIXES
 from roadgeo.storage.files import make_folder
-from roadgeo.storage.rasters import name_page
 
 if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions
@@ -178,29 +181,14 @@ _OPTIONS = (
 )
 @click.argument("masks", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @each(_OPTIONS)
-def locate_command(
-    masks: tuple[str, ...],
-    references: tuple[str, ...],
-    out_dir: str,
-    as_json: bool,
-    jobs: int,
-    quiet: bool,
-    verbose: bool,
-    **given: Any,
-) -> int:
+def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir: str, jobs: int, **given: Any) -> int:
     """Find where images lie on a map, and draw them there; for the help see above."""
-    from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.progress import count_up, print_steps, show_steps
+    from roadgeo.cli.progress import count_up, show_steps
 
     options = make_options(hinted(given), given["method"])
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]), take=given["take"])
     outputs = _output_options(given)
-    found = find_masks(masks, given["recursive"])
-    if not found:
-        raise click.UsageError(f"No images in {', '.join(masks)}.")
-    found = [name_page(name, given["page"]) for name in found]
-    others = found[1:] if given["fuse"] else []
-    tasks = name_tasks(found[:1] if given["fuse"] else found, out_dir)
+    tasks, others = find_tasks(masks, given, out_dir)
     cluster = make_cluster(given, jobs)
     if given["divide_map"] and (cluster is None or given["method"] == "pair" or given["explain"]):
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
@@ -218,24 +206,20 @@ def locate_command(
         skip_existing=given["skip_existing"],
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
-    # Opened here too: their errors are printed once, and the search is compiled before processes start.
-    opened = open_references(references, print_steps(quiet))
-    refuse_swapped(given["near"], opened)
-    compile_once(quiet)
+    opened = open_maps(references, given["near"])
     outcomes: list[Outcome] = []
     is_single = len(tasks) == 1
-    with show_steps(quiet or not is_single) as say, count_up(len(tasks), quiet, as_json, _summarize) as count:
+    steps = show_steps() if is_single else nullcontext(say_nothing)
+    with steps as say, count_up(len(tasks), _summarize) as count:
         for outcome in locate_masks(tasks, references, out_dir, asked, jobs=jobs, cluster=cluster, say=say):
             outcomes.append(outcome)
             count(outcome.status)
-            _report(outcome, as_json, quiet, verbose, single=is_single)
-    if not quiet:
-        tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
+            _report(outcome, is_single)
+    tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
         files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
-        if not quiet:
-            echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
+        tell(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     failed = counts["error"] or any(outcome.faults for outcome in outcomes)
     return ERROR if failed else 0 if counts["located"] + counts["chosen"] == len(tasks) else NOT_LOCATED
 
@@ -245,8 +229,8 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.orthophoto import ImageOptions
 
-    switches = {"gcps": [GCPS], "plot": [OVERLAY], "report": [REPORT], "explain": [EXPLANATION, EXPLANATION_PICTURE]}
-    asked = [*given["products"], *(output.name for name, some in switches.items() if given[name] for output in some)]
+    switched = [output.name for output in REGISTRY.values() if output.option and given[output.option[2:]]]
+    asked = [*given["products"], *([GCPS.name] if given["gcps"] else []), *switched]
     image = ImageOptions(
         given["crs"], given["resolution"], given["resampling"], given["max_pixels"], given["compression"]
     )
@@ -294,8 +278,6 @@ def describe(outcome: Outcome) -> str:
     """Print the result of a mask, in a line or two."""
     found = outcome.document
     words = outcome.status.replace("_", " ")
-    if outcome.status == "error":
-        return f"{paint('Error:', 'red')} {visible(found['reason'])}"
     query = visible(found["query"])
     if outcome.earlier:
         return f"{query}: {words} before"
@@ -324,31 +306,29 @@ def _summarize(counts: Counter[str]) -> str:
     return ", ".join(f"{counts[name]} {text}" for name, text in said.items() if counts[name] or name in always)
 
 
-def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single: bool) -> None:
-    if as_json:
+def _report(outcome: Outcome, single: bool) -> None:
+    if is_set("as_json"):
         echo(json.dumps(outcome.document))
     for fault in outcome.faults:
-        echo(f"{paint('Error:', 'red')} {visible(fault)}", err=True)
+        complain(fault)
     if outcome.status == "error":
-        echo(describe(outcome), err=True)
+        complain(outcome.document["reason"])
         return
-    if quiet:
-        return
-    echo(describe(outcome), err=as_json)
-    if verbose:
-        echo(_details(outcome.document), err=as_json)
+    tell(describe(outcome))
+    if is_set("verbose"):
+        tell(_details(outcome.document))
     if single and outcome.status in ("not_located", "ambiguous"):
-        _list_places(outcome.document, as_json)
-    if (single or verbose) and outcome.files:
-        echo("  wrote " + visible(", ".join(outcome.files)), err=as_json)
+        _list_places(outcome.document)
+    if (single or is_set("verbose")) and outcome.files:
+        tell("  wrote " + visible(", ".join(outcome.files)))
 
 
-def _list_places(document: dict[str, Any], as_json: bool) -> None:
+def _list_places(document: dict[str, Any]) -> None:
     """Print the places that a refusal knows, by the numbers that --take has for them."""
     places = [*([document["center"]] if document["center"] else []), *(p["center"] for p in document["alternatives"])]
     if places:
         listed = ", ".join(f"{n}: {format_lonlat(at['lon'], at['lat'])}" for n, at in enumerate(places, 1))
-        echo(f"  best places, {listed}; where you know one to be right, --take its number", err=as_json)
+        tell(f"  best places, {listed}; where you know one to be right, --take its number")
 
 
 def _details(document: dict[str, Any]) -> str:

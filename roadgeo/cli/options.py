@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, keep_switch
 from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_numbers, read_place, read_range
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference
     from roadgeo.running.cluster import Cluster
     from roadgeo.running.options import ReadOptions
+    from roadgeo.running.tasks import Task
 
 __all__ = [
     "ASPECT",
@@ -37,13 +38,14 @@ __all__ = [
     "Plugin",
     "Read",
     "each",
+    "find_tasks",
     "hinted",
     "make_cluster",
     "make_options",
     "n_threads",
+    "open_maps",
     "out_dir_option",
     "read_options",
-    "refuse_swapped",
     "row",
     "take",
 ]
@@ -315,12 +317,15 @@ def _hint_option(name: str, command: Decorated, **own: Any) -> Decorated:
 
 _SEGMENT = "Which images are photographs, whose roads are found first: those that look so, all, or none. Default: auto."
 
+#: Switches that are for whoever prints, not for the command.
+_KEPT: dict[str, Any] = {"expose_value": False, "callback": keep_switch}
+
 #: Options of several commands by the names that `take` takes; rows as of `row`.
 _SHARED = {
     "references": row("-r --reference references", "REF", WHERE,
         "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
         type=click.Path(), multiple=True),
-    "json": row("--json as_json", "", OTHERS, "Print one JSON object per image and line."),
+    "json": row("--json as_json", "", OTHERS, "Print one JSON object per image and line.", **_KEPT),
     "crs": row("--crs", "CRS", RESULTS, "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.", type=CRS),
     "resolution": row("--resolution", "SIZE", RESULTS,
         "Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
@@ -356,8 +361,8 @@ _SHARED = {
     "scheduler": row("--scheduler", "ADDRESS", SEARCH,
         "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.", rare=True),
     "mavlink": row("--mavlink", "URL", OTHERS, "Also send places to an autopilot, to such as udpout:127.0.0.1:14550."),
-    "quiet": row("-q --quiet", "", OTHERS, "Say nothing but errors, and what --json prints."),
-    "verbose": row("-v --verbose", "", OTHERS, "Say more: numbers, times, files read."),
+    "quiet": row("-q --quiet", "", OTHERS, "Say nothing but errors, and what --json prints.", **_KEPT),
+    "verbose": row("-v --verbose", "", OTHERS, "Say more: numbers, times, files read.", **_KEPT),
 }  # fmt: skip
 
 #: Several that go together.
@@ -423,22 +428,48 @@ def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOption
     return apply_hints(replace(LocateOptions(), method=method), known)
 
 
-def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence[AnyReference]) -> None:
-    """Ask what is meant where a place lies on no map, but would with longitude and latitude exchanged.
+def find_tasks(
+    images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None
+) -> tuple[list[Task], list[str]]:
+    """Return a task for each image that is named; with --fuse for the first, and the others, which belong to it.
 
     Raises
     ------
     click.UsageError
-        It is so.
+        There is no image.
     """
-    from roadgeo.reference.reference import swapped_near
+    from roadgeo.running.tasks import find_masks, name_tasks
+    from roadgeo.storage.rasters import name_page
 
+    found = [name_page(name, given.get("page")) for name in find_masks(images, given["recursive"])]
+    if not found:
+        raise click.UsageError(f"No images in {', '.join(images)}.")
+    n = 1 if given["fuse"] else len(found)
+    return name_tasks(found[:n], out_dir), found[n:]
+
+
+def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = None) -> list[AnyReference]:
+    """Open references, so that their errors are printed once, and make the kernels ready before processes start.
+
+    Raises
+    ------
+    click.UsageError
+        The place of --near lies on no map, but would with longitude and latitude exchanged.
+    """
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import print_steps
+    from roadgeo.reference.reference import swapped_near
+    from roadgeo.running.batch import open_references
+
+    references = open_references(names, print_steps())
     meant = None if near is None else swapped_near(near, references)
     if near is not None and meant is not None:
         raise click.UsageError(
             f"--near={near[0]:.9g},{near[1]:.9g},{near[2]:g} lies on none of the maps; longitude comes first:"
             f" did you mean --near={meant[0]:.9g},{meant[1]:.9g},{meant[2]:g}?"
         )
+    compile_once()
+    return references
 
 
 def n_threads(jobs: int = 1) -> int:

@@ -1,4 +1,4 @@
-"""The one place where commands print."""
+"""The one place where commands print, as --json, --quiet and --verbose of the one that runs have it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 from roadgeo._text import visible
 
-__all__ = ["echo", "paint", "plain"]
+__all__ = ["complain", "echo", "is_set", "keep_switch", "paint", "plain", "tell"]
 
 #: Stands for the escape character in what `paint` returns: no name of a file can hold it.
 _MARK = f"\ufdd0{os.urandom(8).hex()}"
@@ -18,6 +18,28 @@ _MARK = f"\ufdd0{os.urandom(8).hex()}"
 def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
     """Print lines; control characters in names are shown, not obeyed by the terminal."""
     click.echo(visible(text, lines=True).replace(_MARK, "\x1b"), err=err, color=color)
+
+
+def keep_switch(context: click.Context, parameter: click.Parameter, given: bool) -> None:
+    """Keep a switch of the command that runs for all that prints, as click calls back."""
+    context.meta[f"roadgeo.{parameter.name}"] = given
+
+
+def is_set(switch: str) -> bool:
+    """Whether the command that runs was given a switch: "as_json", "quiet" or "verbose"."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(f"roadgeo.{switch}"))
+
+
+def tell(text: str, *, err: bool = False) -> None:
+    """Print lines, but none with --quiet; on standard error where --json takes standard output."""
+    if not is_set("quiet"):
+        echo(text, err=err or is_set("as_json"))
+
+
+def complain(text: str) -> None:
+    """Print an error as one line on standard error."""
+    echo(f"{paint('Error:', 'red')} {' '.join(visible(text).split())}", err=True)
 
 
 def paint(text: str, color: str | None) -> str:

@@ -10,32 +10,32 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import echo, is_set
 
-__all__ = ["count_up", "print_steps", "show_steps"]
+__all__ = ["count_up", "name_counts", "print_steps", "show_steps"]
 
 
 @contextmanager
-def show_steps(quiet: bool) -> Iterator[Say]:
+def show_steps() -> Iterator[Say]:
     """Show the steps on standard error: yield a function that receives each step and the share of it that is done.
 
     On a terminal each step has a bar, with the time it has left where its share is known; elsewhere see `print_steps`.
     """
     as_json = os.environ.get("ROADGEO_PROGRESS") == "json"
-    if not quiet and not as_json and sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
+    if not is_set("quiet") and not as_json and sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
         with _show_bars() as say:
             yield say
     else:
-        yield print_steps(quiet)
+        yield print_steps()
 
 
-def print_steps(quiet: bool) -> Say:
+def print_steps() -> Say:
     """Return a function that prints each step once, as a line on standard error.
 
     Programs that set ROADGEO_PROGRESS=json get lines such as {"progress": {"done": 30, "total": 100, "text": "..."}}
     besides, where a share is known.
     """
-    if quiet:
+    if is_set("quiet"):
         return say_nothing
     as_json = os.environ.get("ROADGEO_PROGRESS") == "json"
     last = "", -1
@@ -79,12 +79,10 @@ def name_counts(counts: Counter[str]) -> str:
 
 
 @contextmanager
-def count_up(
-    total: int, quiet: bool, as_json: bool = False, summarize: Callable[[Counter[str]], str] = name_counts
-) -> Iterator[Callable[[str], None]]:
+def count_up(total: int, summarize: Callable[[Counter[str]], str] = name_counts) -> Iterator[Callable[[str], None]]:
     """Show on standard error how many of `total` are done; yield a function that counts one more of a sort.
 
-    People get a bar on a terminal, unless the JSON of `as_json` fills that too, or there is but one to do. Programs
+    People get a bar on a terminal, unless the JSON of --json fills that too, or there is but one to do. Programs
     that set ROADGEO_PROGRESS=json get lines like {"progress": {"done": 3, "total": 10, "text": "2 located, 1 failed"}}.
     """
     counts: Counter[str] = Counter()
@@ -92,7 +90,7 @@ def count_up(
         show: AbstractContextManager[Callable[[str], None]] = nullcontext(
             lambda text: _print_json(counts.total(), total, text)
         )
-    elif quiet or total < 2 or not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
+    elif is_set("quiet") or total < 2 or not sys.stderr.isatty() or (is_set("as_json") and sys.stdout.isatty()):
         show = nullcontext(lambda _: None)
     else:
         show = _show_bar(total)

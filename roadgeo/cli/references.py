@@ -10,7 +10,7 @@ import click
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, Group
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import complain, echo
 
 __all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
 
@@ -104,7 +104,7 @@ def check_command(references: tuple[str, ...]) -> int:
         except RoadgeoError as error:
             problems = [str(error)]
         for problem in problems:
-            echo(f"Error: {visible(str(problem))}", err=True)
+            complain(str(problem))
         if problems:
             status = ERROR
         else:
@@ -137,7 +137,7 @@ def list_command(as_json: bool) -> int:
         try:
             described = describe_reference(path)
         except RoadgeoError as error:
-            echo(f"Error: {error}", err=True)
+            complain(str(error))
             status = ERROR
             continue
         whole = {"schema": SCHEMA, **made_by(), **described}

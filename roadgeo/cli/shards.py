@@ -9,42 +9,29 @@ from typing import Any
 
 import click
 
-from roadgeo.cli.options import each, make_cluster, row
-from roadgeo.cli.printing import echo
+from roadgeo.cli.options import Read, each, make_cluster, row
+from roadgeo.cli.printing import tell
 
-__all__ = ["build_in_shards", "shard_options"]
+__all__ = ["build_in_shards", "shard_options", "tell_built"]
 
 
-class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in late versions of click
-    """How a map is cut: "auto", about how many shards, or the side of square ones: "25km"."""
-
-    name = "shards"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, Any]:
-        """Return the options of the build, by their names.
-
-        Raises
-        ------
-        click.BadParameter
-            It is something else.
-        """
-        if isinstance(value, dict):
-            return value
-        size = re.fullmatch(r"([0-9.]+) ?km", value)
-        if value == "auto":
-            return {}
-        if value.isdecimal() and int(value) > 0:
-            return {"count": int(value)}
-        if size and size[1].count(".") < 2 and size[1] != "." and 1 <= float(size[1]) <= 1000:
-            return {"size_m": 1000.0 * float(size[1])}
-        return self.fail(f"got {value!r}, expected auto, a number, or a side such as 25km (1 to 1000)", param, ctx)
+def _read_shards(text: str) -> dict[str, Any]:
+    """Read how a map is cut, as options of the build: "auto", about how many shards, or the side of square ones."""
+    if text == "auto":
+        return {}
+    if text.isdecimal() and int(text) > 0:
+        return {"count": int(text)}
+    size = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?km", text)
+    if size and 1 <= float(size[1]) <= 1000:
+        return {"size_m": 1000.0 * float(size[1])}
+    raise ValueError(f"got {text!r}, expected auto, a number, or a side such as 25km (1 to 1000)")
 
 
 #: Adds the options that control how a map is cut.
 shard_options = each((
     row("--shards", "auto|N|SIZEkm", "In pieces",
         "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
-        type=_Shards()),
+        type=Read("shards", _read_shards)),
     row("--margin", "METRES", "In pieces",
         "Ground that neighbours share. Half the diagonal of the largest frame to locate.",
         type=click.FloatRange(0, 100_000), default=3000.0, show_default=True, rare=True),
@@ -53,7 +40,7 @@ shard_options = each((
 ))  # fmt: skip
 
 
-def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any], quiet: bool) -> None:
+def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any]) -> None:
     """Build a reference in shards from road files, and describe the result.
 
     Raises
@@ -81,13 +68,17 @@ def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: 
     # Sources and options.
     which = (source[name] for name in ("layer", "crs", "kinds", "tunnels", "bbox", "attribution"))
     files = RoadFiles(tuple(map(Path, source["roads"])), *which)
-    compile_once(quiet, map_only=True)
-    with show_steps(quiet) as say:
+    compile_once(map_only=True)
+    with show_steps() as say:
         options, jobs = ShardOptions(**shards, margin_m=source["margin"]), source["jobs"]
         cluster = make_cluster(source, jobs)
         reference = build_shards(files, path, make_slug(name), options, jobs=jobs, cluster=cluster, say=say)
-    if not quiet:
-        entries = reference.manifest.filled
-        n = sum(entry.own_intersections for entry in entries)
-        found = f"{path}: {n:,} intersections in {len(entries)} shards in {perf_counter() - started:.1f} s"
-        echo(f"{found}; search it with `roadgeo locate photo.jpg -r {out or path.stem}`")
+    entries = reference.manifest.filled
+    n = sum(entry.own_intersections for entry in entries)
+    tell_built(f"{path}: {n:,} intersections in {len(entries)} shards", started, out or path.stem)
+
+
+def tell_built(found: str, started: float, reference: str) -> None:
+    """Print what was built, since a moment of `perf_counter`, and how it is searched."""
+    seconds = perf_counter() - started
+    tell(f"{found} in {seconds:.1f} s; search it with `roadgeo locate photo.jpg -r {reference}`")

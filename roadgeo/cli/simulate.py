@@ -9,7 +9,7 @@ import click
 
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.options import out_dir_option, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import tell
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
 
@@ -21,7 +21,7 @@ __all__ = ["simulate_command"]
 @out_dir_option("Where to write.", None, Path, required=True)
 @query_options
 @take("quiet")
-def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: bool, **options: Any) -> None:
+def simulate_command(reference: str, out_dir: Path, roads: Path | None, **options: Any) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
     Writes NOISE/q_NNNN.png, footprints.gpkg, and truth.csv and truth.json, which hold for each mask the homography from
@@ -45,7 +45,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     sets = query_sets(options)
     landscape = read_landscape(resolve_whole(reference), roads)
     truths = []
-    with count_up(sum(count for _, count in sets), quiet) as advance:
+    with count_up(sum(count for _, count in sets)) as advance:
         for simulation, count in sets:
             make_folder(out_dir / simulation.kind)
             for k in range(count):
@@ -54,5 +54,4 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
                 truths.append(query.truth)
                 advance(simulation.kind)
     write_truth(out_dir, truths, made_by())
-    if not quiet:
-        echo(f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True)
+    tell(f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True)

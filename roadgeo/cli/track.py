@@ -22,13 +22,13 @@ from roadgeo.cli.options import (
     each,
     hinted,
     make_options,
+    open_maps,
     out_dir_option,
     read_options,
-    refuse_swapped,
     row,
     take,
 )
-from roadgeo.cli.printing import echo, paint
+from roadgeo.cli.printing import echo, is_set, paint, tell
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
@@ -132,33 +132,26 @@ def track_command(
     references: tuple[str, ...],
     out_dir: str,
     name: str,
-    as_json: bool,
     start: datetime | None,
     mavlink: str | None,
     focal_px: Any,
     unordered: bool,
-    quiet: bool,
-    verbose: bool,
     **given: Any,
 ) -> int:
     """Follow a flight over the map, frame by frame; for the help see above."""
-    from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.progress import print_steps
+    from roadgeo.cli.progress import name_counts
     from roadgeo.flights.frames import follow_frames
     from roadgeo.flights.report import Thumbnails
     from roadgeo.flights.rows import make_rows
     from roadgeo.flights.tracker import TrackOptions
-    from roadgeo.running.batch import open_references
 
     if focal_px == "exif":
         raise click.UsageError("--focal exif: of frames give the focal length in pixels.")
     if unordered and (mavlink or given["motion"]):
         raise click.UsageError("--unordered frames are no flight: leave out --mavlink and --motion.")
     options, reading = TrackOptions(locate=make_options(hinted(given))), _frame_options(given)
-    opened: Any = open_references(references, print_steps(quiet))
-    refuse_swapped(given["near"], opened)
+    opened: Any = open_maps(references, given["near"])
     make_folder(out_dir)
-    compile_once(quiet)
     # Frames are printed as they come; later knowledge of earlier ones replaces their rows.
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
@@ -169,17 +162,15 @@ def track_command(
             fresh = make_rows(news, start, focal_px)
             send(fresh[-1])
             for row in fresh:
-                _print(row, as_json, quiet, verbose)
+                _print(row)
     tracked = [known[number] for number in sorted(known)]
     if not tracked:
         raise click.UsageError(f"No frames in {', '.join(frames)}.")
     rows = make_rows(tracked, start, focal_px)
     files = _write(Path(out_dir), name, tracked, rows, pictures)
     counts = Counter(row.status for row in rows)
-    if not quiet:
-        tell_accuracy(row.to_dict() for row in rows)
-        summary = ", ".join(f"{n} {status}" for status, n in counts.items())
-        echo(f"{len(rows)} frames: {summary}; wrote {', '.join(files)}", err=True)
+    tell_accuracy(row.to_dict() for row in rows)
+    tell(f"{len(rows)} frames: {name_counts(counts)}; wrote {', '.join(files)}", err=True)
     return NOT_LOCATED if counts["lost"] else 0
 
 
@@ -251,13 +242,13 @@ def _write(folder: Path, name: str, tracked: list[Tracked], rows: list[Row], pic
 _SHOWN = {"located": "green", "tracked": "green", "predicted": "yellow", "lost": "red"}
 
 
-def _print(row: Row, as_json: bool, quiet: bool, verbose: bool) -> None:
-    if as_json:
+def _print(row: Row) -> None:
+    if is_set("as_json"):
         echo(json.dumps(row.to_dict()))
-    elif not quiet:
+    else:
         from roadgeo.outputs.wording import format_lonlat
 
         status = paint(row.status, _SHOWN[row.status])
         where = "" if row.center is None else f" at {format_lonlat(*row.center)}, sigma {row.sigma_m:.1f} m"
-        why = f": {row.reason}" if verbose or row.status in ("lost", "predicted") else ""
-        echo(f"{row.name}: {status}{where}{why}")
+        why = f": {row.reason}" if is_set("verbose") or row.status in ("lost", "predicted") else ""
+        tell(f"{row.name}: {status}{where}{why}")

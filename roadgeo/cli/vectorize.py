@@ -9,7 +9,7 @@ import click
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.options import Command, out_dir_option, read_options, take
-from roadgeo.cli.printing import echo
+from roadgeo.cli.printing import complain, echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 from roadgeo.storage.files import make_folder
@@ -44,20 +44,20 @@ def vectorize_command(
     from roadgeo.errors import RoadgeoError
 
     make_folder(out_dir)
-    compile_once(quiet=False)
+    compile_once()
     reading = read_options(given)
     status = 0
-    with show_steps(quiet=False) as say:
+    with show_steps() as say:
         for task in name_tasks(find_masks(images, recursive)):
             try:
                 seen = _show(task, out_dir, gsd_m, reading, say)
             except RoadgeoError as error:
-                echo(f"Error: {error}", err=True)
+                complain(str(error))
                 status = ERROR
                 continue
             except Exception as error:  # of a library: nothing wrong with one mask stops the others
-                what = visible(f"{task.mask}: {type(error).__name__}: {error}")
-                echo(f"Error: {what}; this is a fault of roadgeo, please report it", err=True)
+                what = f"{task.mask}: {type(error).__name__}: {error}"
+                complain(f"{what}; this is a fault of roadgeo, please report it")
                 status = ERROR
                 continue
             echo(visible(f"{task.mask}: {seen}"))

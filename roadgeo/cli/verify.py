@@ -13,8 +13,20 @@ import click
 
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import IMAGE, OTHERS, RESULTS, Command, each, out_dir_option, read_options, row, take
-from roadgeo.cli.printing import echo, paint, plain
+from roadgeo.cli.options import (
+    IMAGE,
+    OTHERS,
+    RESULTS,
+    Command,
+    each,
+    find_tasks,
+    open_maps,
+    out_dir_option,
+    read_options,
+    row,
+    take,
+)
+from roadgeo.cli.printing import complain, echo, is_set, paint, plain, tell
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
@@ -57,15 +69,7 @@ _OPTIONS = (
 @click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they claim to be.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @each(_OPTIONS)
-def verify_command(
-    images: tuple[str, ...],
-    out_dir: str,
-    as_json: bool,
-    jobs: int,
-    quiet: bool,
-    verbose: bool,
-    **given: Any,
-) -> int:
+def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: Any) -> int:
     """Check whether georeferenced IMAGEs are where they claim to be, by the roads they show.
 
     An image is a road mask or a photograph with a place: a geotransform, control
@@ -89,38 +93,29 @@ def verify_command(
 
     Exit status: 0 all agree, 4 at least one is off, 3 none is off but some are unknown, 1 error, 2 usage.
     """
-    from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.progress import count_up, print_steps
+    from roadgeo.cli.progress import count_up, name_counts
     from roadgeo.outputs.verification_files import write_table
-    from roadgeo.running.batch import open_references
     from roadgeo.running.processes import run
-    from roadgeo.running.tasks import find_masks, name_tasks
 
-    found = find_masks(images, given["recursive"])
-    if not found:
-        raise click.UsageError(f"No images in {', '.join(images)}.")
-    tasks = name_tasks(found[:1] if given["fuse"] else found)
-    settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
-    opened = open_references(settings.references, print_steps(quiet))  # their errors are printed once
-    compile_once(quiet)
+    tasks, others = find_tasks(images, given)
+    settings = _settings(given, others, jobs)
+    opened = open_maps(settings.references)
     if given["fix"] or given["report"] or len(tasks) > 1:
         make_folder(out_dir)
     results: list[Verified] = []
-    with count_up(len(tasks), quiet, as_json) as count:
+    with count_up(len(tasks)) as count:
         for task, verified in zip(tasks, run(tasks, settings, jobs), strict=True):
             results.append(verified)
             count(verified.verdict)
             stem = Path(out_dir) / task.stem
             pages = [_write_page(verified, task.mask, stem, opened, settings)] if given["report"] else []
             files = [*pages, *_correct(verified, Path(task.mask), stem, given["fix"], given["in_place"])]
-            _report(verified, files, as_json, quiet, verbose)
+            _report(verified, files)
     documents = [verified.document for verified in results]
     counts = Counter(verified.verdict for verified in results)
     if len(tasks) > 1:
         write_table(Path(out_dir) / "roadgeo_verify.csv", documents)
-        if not quiet:
-            said = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-            echo(f"{said}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
+        tell(f"{name_counts(counts)}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
     return ERROR if counts["error"] else OFF if counts["off"] else NOT_LOCATED if counts["unknown"] else 0
 
 
@@ -182,14 +177,15 @@ def describe(document: dict[str, Any]) -> str:
     return f"{document['image']}: {word}: {document['reason']}"
 
 
-def _report(verified: Verified, files: list[Path], as_json: bool, quiet: bool, verbose: bool) -> None:
-    if as_json:
-        echo(json.dumps({**verified.document, **made_by()}))
+def _report(verified: Verified, files: list[Path]) -> None:
+    document = verified.document
+    if is_set("as_json"):
+        echo(json.dumps({**document, **made_by()}))
     if verified.verdict == "error":
-        echo(f"{paint('Error:', 'red')} {' '.join(verified.document['reason'].split())}", err=True)
-    elif not quiet:
-        echo(describe(verified.document), err=as_json)
-        if verbose and verified.document.get("log10_lead") is not None:
-            echo(f"  leads any other place nearby by 10^{verified.document['log10_lead']:.1f}", err=as_json)
-        if files:
-            echo(f"  wrote {', '.join(map(str, files))}", err=as_json)
+        complain(document["reason"])
+        return
+    tell(describe(document))
+    if is_set("verbose") and document.get("log10_lead") is not None:
+        tell(f"  leads any other place nearby by 10^{document['log10_lead']:.1f}")
+    if files:
+        tell(f"  wrote {', '.join(map(str, files))}")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import click
 import pytest
 from worlds.fenway import write_streets
 
@@ -24,20 +25,22 @@ def walk(say):
 
 def test_elsewhere_each_step_is_one_line(capsys, monkeypatch):
     monkeypatch.delenv("ROADGEO_PROGRESS", raising=False)
-    with show_steps(quiet=False) as say:
+    with show_steps() as say:
         walk(say)
     assert capsys.readouterr() == ("", "reading ...\ndrawing ...\nwriting ...\n")
 
 
 def test_quiet_is_quiet(capsys):
-    with show_steps(quiet=True) as say:
-        walk(say)
+    with click.Context(click.Command("index")) as context:
+        context.meta["roadgeo.quiet"] = True
+        with show_steps() as say:
+            walk(say)
     assert capsys.readouterr() == ("", "")
 
 
 def test_programs_get_lines_of_json_each_per_cent_once(capsys, monkeypatch):
     monkeypatch.setenv("ROADGEO_PROGRESS", "json")
-    walk(print_steps(quiet=False))
+    walk(print_steps())
     output = capsys.readouterr().err.splitlines()
     shares = [json.loads(line)["progress"] for line in output if line.startswith("{")]
     assert shares == [{"done": k, "total": 100, "text": "drawing"} for k in range(100)]
@@ -79,7 +82,7 @@ def test_on_a_terminal_each_step_has_a_bar_and_nothing_of_it_stays():
     steps = """
 import time
 from roadgeo.cli.progress import show_steps
-with show_steps(False) as say:
+with show_steps() as say:
     say("asking")
     for k in range(10):
         say("reading roads.osm.pbf", k / 10)
@@ -98,7 +101,7 @@ def test_on_a_terminal_many_masks_are_counted_beside_a_bar():
 import time
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
-with count_up(3, False) as count:
+with count_up(3) as count:
     for sort in ("located", "located", "not located"):
         time.sleep(0.2)
         echo(f"one more {sort}", err=True)
@@ -114,12 +117,15 @@ with count_up(3, False) as count:
     assert re.search(r"\x1b\[2K\s*$", terminal.text)
 
 
-@pytest.mark.parametrize(("total", "quiet", "as_json"), [(3, True, False), (1, False, False)])
-def test_a_single_mask_and_a_quiet_run_have_no_bar(total, quiet, as_json):
+@pytest.mark.parametrize(("total", "quiet"), [(3, True), (1, False)])
+def test_a_single_mask_and_a_quiet_run_have_no_bar(total, quiet):
     code = f"""
+import click
 from roadgeo.cli.progress import count_up
-with count_up({total}, {quiet}, {as_json}) as count:
-    count("located")
+with click.Context(click.Command("locate")) as context:
+    context.meta["roadgeo.quiet"] = {quiet}
+    with count_up({total}) as count:
+        count("located")
 """
     terminal = Terminal(sys.executable, "-c", code)
     assert terminal.end() == 0
@@ -137,8 +143,8 @@ from contextlib import contextmanager
 from roadgeo.cli import main, progress
 shown = progress.show_steps
 @contextmanager
-def slow_steps(quiet):
-    with shown(quiet) as say:
+def slow_steps():
+    with shown() as say:
         def wait(text, share=None):
             say(text, share)
             if text.startswith(sys.argv[1]):

@@ -56,7 +56,7 @@ def test_no_option_is_taken_and_dropped(name: str, command: click.Command) -> No
     if "publisher" in inspect.signature(callback).parameters:
         return  # all that it is given goes on
     taken = read_in(callback.__module__)
-    own = {param.name for param in command.params if not getattr(param, "is_eager", False)}
+    own = {param.name for param in command.params if param.expose_value and not param.is_eager}
     assert own <= taken, name
 
 
