@@ -17,13 +17,13 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.matching.explanation import Explanation, Funnel, RejectedPlace, Story
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.outputs.drawing.layers import Color, Dots, Layer, Lines, Ring, rgb
 from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_legend, write_png, write_text
-from roadgeo.outputs.drawing.views import Shown, ViewOptions, Window, frame_layers, map_layer
+from roadgeo.outputs.drawing.views import Window, map_layer, mask_layer
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
@@ -63,9 +63,8 @@ def write_explanation(path: Path, subject: Subject) -> None:
 
 
 def write_explanation_picture(path: Path, subject: Subject) -> None:
-    """Write `draw_explanation` as PNG, on the map that came nearest to an answer."""
-    explanation = _explained(subject)
-    write_png(path, draw_explanation(explanation, subject.mask, subject.index_of(explanation.nearest.reference)))
+    """Write `draw_explanation` as PNG."""
+    write_png(path, draw_explanation(subject))
 
 
 def _explained(subject: Subject) -> Explanation:
@@ -74,13 +73,8 @@ def _explained(subject: Subject) -> Explanation:
     return subject.explanation
 
 
-def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceIndex) -> AnyArray:
-    """Draw why a mask was or was not located on one reference.
-
-    Parameters
-    ----------
-    index : ReferenceIndex
-        The hypothesis that the picture explains.
+def draw_explanation(subject: Subject) -> AnyArray:
+    """Draw why a mask was or was not located, on the reference that came nearest to an answer.
 
     Returns
     -------
@@ -88,9 +82,10 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
         Red, green, blue. Left the mask, its traced roads and intersections, and below how many candidates each stage
         left; right the best places: the mask's roads on the map's, teal where they agree and orange where not.
     """
-    stories = explanation.stories
+    explanation = _explained(subject)
+    index, stories = subject.index_of(explanation.nearest.reference), explanation.stories
     story = next((each for each in stories if each.reference == index.name), stories[0])
-    left = np.vstack([_draw_seen(explanation, mask, index), _draw_funnel(story)])
+    left = np.vstack([_draw_seen(subject, explanation), _draw_funnel(story)])
     right = np.vstack([_draw_places(story.places, explanation.scene, index), _draw_notes(story)])
     height = max(len(left), len(right))
     picture = blank(_HEAD + height + _MARGIN, _WIDTH)
@@ -109,20 +104,18 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
 # --- the mask ---------------------------------------------------------------------------------------------------------
 
 
-def _draw_seen(explanation: Explanation, mask: RoadMask, index: ReferenceIndex) -> AnyArray:
+def _draw_seen(subject: Subject, explanation: Explanation) -> AnyArray:
     """Draw the mask, its traced roads and its intersections, and a line of numbers below."""
-    scene, location = explanation.scene, explanation.location
-    lines = [plane_to_pixel(line) for line in explanation.graph.polylines()]
+    scene = explanation.scene
+    roads = Lines([plane_to_pixel(line) for line in explanation.graph.polylines()])
     crossings = plane_to_pixel(scene.intersections.xy)
-    shown = Shown(location, mask, index, ViewOptions(), None, lines, crossings, None, "")
-    canvas = Canvas.of(shown.box, _MASK, _MASK)
-    drawn = [layer for layer in frame_layers(shown) if layer.name in {"picture", "query-roads"}]
-    canvas.draw([*drawn, Layer("matches", "", [Dots(crossings)])])
+    canvas = Canvas.of(subject.box, _MASK, _MASK)
+    canvas.draw([mask_layer(subject), Layer("query-roads", "", [roads]), Layer("matches", "", [Dots(crossings)])])
     panel, image = blank(_MASK + 40, _MASK), canvas.image[:_MASK, :_MASK]
     top, left = (_MASK - len(image)) // 2, (_MASK - image.shape[1]) // 2
     panel[top : top + len(image), left : left + image.shape[1]] = image
     unseen_share = 1.0 - float(scene.observed.mean())
-    numbers = f"{shown.size[0]} x {shown.size[1]} px   ·   {counted(len(crossings), 'intersection')}"
+    numbers = f"{subject.mask_size[0]} x {subject.mask_size[1]} px   ·   {counted(len(crossings), 'intersection')}"
     numbers += f"   ·   {counted(scene.n_edges, 'road')}"
     if unseen_share > 0.01:
         numbers += f"   ·   {unseen_share:.0%} not observed"

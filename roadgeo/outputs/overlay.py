@@ -25,9 +25,9 @@ from roadgeo.outputs.drawing.raster import (
     write_png,
     write_text,
 )
-from roadgeo.outputs.drawing.views import STILL, Shown, ViewOptions, Window, frame_layers, place_layers
+from roadgeo.outputs.drawing.views import STILL, Window, frame_layers, mask_layer, place_layers
 from roadgeo.outputs.names import bare_name
-from roadgeo.outputs.subject import Subject
+from roadgeo.outputs.subject import Subject, ViewOptions
 from roadgeo.outputs.wording import format_lonlat, write_sigma
 
 __all__ = ["MAP_PX", "MASK_SHARE", "draw_overlay", "write_overlay"]
@@ -44,12 +44,10 @@ MAP_PX, _MARGIN, MASK_SHARE = 1400, 0.14, 0.6
 
 def write_overlay(path: Path, subject: Subject) -> None:
     """Write `draw_overlay` as PNG."""
-    views = ViewOptions(picture_px=MAP_PX)
-    shown = Shown.of(subject.location, subject.mask, subject.index, subject.photo, views, subject.attribution)
-    write_png(path, draw_overlay(shown))
+    write_png(path, draw_overlay(replace(subject, views=ViewOptions(picture_px=MAP_PX))))
 
 
-def draw_overlay(subject: Shown, map_px: int = MAP_PX) -> AnyArray:
+def draw_overlay(subject: Subject, map_px: int = MAP_PX) -> AnyArray:
     """Draw a located mask on the map.
 
     Returns
@@ -62,11 +60,10 @@ def draw_overlay(subject: Shown, map_px: int = MAP_PX) -> AnyArray:
     OutputError
         The location has no place.
     """
-    place = subject.placed()
     # The map.
-    window = Window.around(place.footprint, _MARGIN).no_longer_than(_LONGEST)
+    window = Window.around(subject.place.footprint, _MARGIN).no_longer_than(_LONGEST)
     canvas = Canvas.of(window.box, map_px, map_px)
-    layers = [layer for layer in place_layers(subject, place, window) if layer.name in STILL]
+    layers = [layer for layer in place_layers(subject, window) if layer.name in STILL]
     canvas.draw(layers)
     top = round(map_px * 0.075)
     draw_scale_bar(canvas, top // 4)
@@ -104,16 +101,16 @@ def _summary(location: Location) -> str:
     return "   ·   ".join(parts)
 
 
-def _draw_frames(panel: AnyArray, subject: Shown) -> None:
+def _draw_frames(panel: AnyArray, subject: Subject) -> None:
     """Draw the photograph, if there is one, above the mask with its roads, in the middle of a panel (h, w, 3)."""
     height, width = panel.shape[:2]
-    bare = frame_layers(replace(subject, photograph=None))
-    views = [[layer for layer in bare if layer.name != "unmatched"]]
-    if subject.photograph is not None:
-        views.insert(0, [layer for layer in frame_layers(subject) if layer.name in {"picture", "edge"}])
+    picture, *marks = frame_layers(subject)
+    views = [[mask_layer(subject), *(layer for layer in marks if layer.name != "unmatched")]]
+    if subject.photo is not None:
+        views.insert(0, [picture, marks[-1]])
     n = len(views)
     room = width - 2 * _GAP, (height - 2 * n * _GAP) / n
-    scale = min(room[0] / subject.size[0], room[1] / subject.size[1])
+    scale = min(room[0] / subject.box[2], room[1] / subject.box[3])
     drawn = [_draw_view(subject, view, scale) for view in views]
     top = (height - sum(map(len, drawn))) // 2
     for image in drawn:
@@ -122,7 +119,7 @@ def _draw_frames(panel: AnyArray, subject: Shown) -> None:
         top += len(image)
 
 
-def _draw_view(subject: Shown, layers: list[Layer], scale: float) -> AnyArray:
+def _draw_view(subject: Subject, layers: list[Layer], scale: float) -> AnyArray:
     """Draw layers of the frame with room around them for its outline."""
     pad = (_GAP - 1) / scale
     x, y, width, height = subject.box

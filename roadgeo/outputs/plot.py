@@ -12,7 +12,8 @@ from roadgeo.errors import OutputError
 from roadgeo.outputs.drawing.layers import Layer
 from roadgeo.outputs.drawing.raster import Canvas, write_png
 from roadgeo.outputs.drawing.svg import draw_layer, stylesheet
-from roadgeo.outputs.drawing.views import STILL, Shown, Window, place_layers
+from roadgeo.outputs.drawing.views import STILL, Window, place_layers
+from roadgeo.outputs.subject import Subject
 from roadgeo.storage.files import replacing, write_text
 
 __all__ = ["Plot", "draw_plot"]
@@ -69,7 +70,7 @@ class Plot:
             raise OutputError(f"{target}: a plot is saved as .svg or .png; choose one of these names")
 
 
-def draw_plot(subject: Shown) -> Plot:
+def draw_plot(subject: Subject) -> Plot:
     """Draw the footprint of a located mask, its roads and its matches over the roads of the map.
 
     Raises
@@ -77,7 +78,6 @@ def draw_plot(subject: Shown) -> Plot:
     OutputError
         The location has no place.
     """
-    place = subject.placed()
-    window = Window.around(place.footprint, _MARGIN)
-    layers = [layer for layer in place_layers(subject, place, window) if layer.name in STILL]
+    window = Window.around(subject.place.footprint, _MARGIN)
+    layers = [layer for layer in place_layers(subject, window) if layer.name in STILL]
     return Plot(window.width, window.height, layers, subject.attribution)

@@ -10,26 +10,58 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, OutputError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.warping import MapGrid, cover
-from roadgeo.location import Location
+from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography
+from roadgeo.matching.scene import trace_query
+from roadgeo.outputs.drawing.layers import Box
+from roadgeo.outputs.drawing.svg import thin_lines
+from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography, read_preview
 from roadgeo.outputs.paths import OutputPaths, Placement
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
-__all__ = ["Match", "Subject"]
+__all__ = ["Match", "Subject", "ViewOptions"]
 
 #: Rows and columns of the grid of control points, from corner to corner.
 _GRID = 5
 
 #: A warped mask is drawn in memory, so it is made coarser beyond this.
 _MASK_MAX_PIXELS = 100_000_000
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How much the views of a result hold.
+
+    Attributes
+    ----------
+    margin, reach : float
+        Ground shown around the footprint at first, and ground whose roads are there to be moved to, in lengths of the
+        footprint's longer side.
+    max_map_vertices, max_query_vertices : int
+        Vertices of the roads of the map, and of the mask.
+    max_matches : int
+        Those with the largest residuals are listed and drawn.
+    picture_px, picture_bytes : int
+        Longer side of the photograph or mask, and size of each of its two copies: in its frame and on the map.
+    overview_bytes : int
+        Size of the picture of the whole map.
+    """
+
+    margin: float = 0.12
+    reach: float = 0.7
+    max_map_vertices: int = 80_000
+    max_query_vertices: int = 25_000
+    max_matches: int = 1500
+    picture_px: int = 1400
+    picture_bytes: int = 300_000
+    overview_bytes: int = 150_000
 
 
 class Match(NamedTuple):
@@ -69,6 +101,8 @@ class Subject:
         The maps that were searched.
     explanation : Explanation or None
         Given where one was asked for.
+    views : ViewOptions
+        How much pages and pictures show.
     """
 
     location: Location
@@ -78,6 +112,7 @@ class Subject:
     photo: Path | None = None
     indexes: Sequence[ReferenceIndex] = ()
     explanation: Explanation | None = None
+    views: ViewOptions = field(default_factory=ViewOptions)
 
     @property
     def picture(self) -> Path:
@@ -106,6 +141,11 @@ class Subject:
             raise OutputError(f"{self.location.query}: no map is given to draw it on")
         return next((index for index in self.indexes if index.name == name), self.indexes[0])
 
+    @property
+    def has_place(self) -> bool:
+        """Whether it lies anywhere, be it surely or not."""
+        return self.location.homography is not None
+
     @cached_property
     def place(self) -> Placement:
         """Where it lies."""
@@ -113,10 +153,9 @@ class Subject:
 
     @cached_property
     def _registered(self) -> tuple[FloatArray, tuple[int, int]]:
-        mask_size = self.mask.shape[1], self.mask.shape[0]
         if self.photo is None:
-            return self.place.homography, mask_size
-        return image_homography(self.place, mask_size, self.photo)
+            return self.place.homography, self.mask_size
+        return image_homography(self.place, self.mask_size, self.photo)
 
     @property
     def homography(self) -> FloatArray:
@@ -127,6 +166,66 @@ class Subject:
     def size(self) -> tuple[int, int]:
         """Width and height of the picture."""
         return self._registered[1]
+
+    @property
+    def mask_size(self) -> tuple[int, int]:
+        """Width and height of the mask."""
+        return self.mask.shape[1], self.mask.shape[0]
+
+    @property
+    def box(self) -> Box:
+        """The frame, in the mask's pixels."""
+        return 0.0, 0.0, float(self.mask_size[0]), float(self.mask_size[1])
+
+    @property
+    def kind(self) -> str:
+        """Kind of the image, in words: "photograph" or "mask"."""
+        return "mask" if self.photo is None and self.mask.probability is None else "photograph"
+
+    @cached_property
+    def reduced(self) -> AnyArray | None:
+        """(h, w, 4) uint8, the photograph as views show it; None without one."""
+        return None if self.photo is None else read_preview(self.photo, self.views.picture_px)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        """The mask's roads and intersections, traced again where they are not known."""
+        if self.location.seen is not None:
+            return self.location.seen
+        scene, graph = trace_query(self.mask)
+        return Seen(graph, scene.intersections.xy)
+
+    @cached_property
+    def lines(self) -> list[FloatArray]:
+        """The mask's roads (V, 2) as views show them, pixels.
+
+        Raises
+        ------
+        MaskError
+            It shows none.
+        """
+        lines = [plane_to_pixel(line) for line in self._seen.graph.polylines()]
+        return thin_lines(lines, self.views.max_query_vertices, 0.4)
+
+    @property
+    def crossings(self) -> FloatArray:
+        """(N, 2) intersections of the mask, pixels."""
+        return plane_to_pixel(self._seen.xy)
+
+    def largest_residuals(self) -> Evidence | None:
+        """Return the matches with the largest residuals, in falling order, as many as views show."""
+        evidence = self.location.evidence
+        if evidence is None:
+            return None
+        first = np.argsort(-evidence.residual_m, kind="stable")[: self.views.max_matches]
+        picked = (evidence.query_xy[first], evidence.reference_xy[first], evidence.residual_m[first])
+        return Evidence(evidence.query_graph, *picked)
+
+    def runner_up(self) -> FloatArray | None:
+        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
+        location = self.location
+        other = location.runner_up if self.has_place else next(iter(location.alternatives), None)
+        return None if other is None else np.array([other.x, other.y])
 
     @cached_property
     def target(self) -> Target:

@@ -93,11 +93,9 @@ class Answer(Location):
         NotLocatedError
             There is no place.
         """
-        from roadgeo.outputs.drawing.views import Shown
         from roadgeo.outputs.plot import draw_plot
 
-        subject = self._subject()
-        return draw_plot(Shown.of(self, self.mask, subject.index, attribution=subject.attribution))
+        return draw_plot(self._subject())
 
     def to_xarray(self) -> xr.DataArray:
         """Return the mask on the map, dimensions y and x: 0 outside the footprint, 1 ground, 2 road.

@@ -7,6 +7,7 @@ import json
 import pickle
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location
+from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
-from roadgeo.outputs.drawing.views import Shown, ViewOptions
+from roadgeo.outputs.drawing.views import draw_picture
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
-from roadgeo.outputs.paths import Placement, output_paths
+from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
-from roadgeo.outputs.subject import Subject
+from roadgeo.outputs.subject import Subject, ViewOptions
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.storage.files import replacing
@@ -50,7 +52,6 @@ OFFERED: dict[str, Output] = {
 #: Longer side of the picture, and on the map, pixels; their quality; side of the CRS in which web maps draw, metres.
 _SIDE, _MAP_SIDE, _QUALITY, _WORLD_M = 1600, 1280, 82, 2 * 20037508.342789244
 _WEB = "EPSG:3857"
-_MASK_COLOR = (228, 87, 46)
 
 
 def safe_stem(name: str) -> str:
@@ -65,17 +66,15 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     folder.mkdir(exist_ok=True)
     indexes = [reference.index_of(location) for reference in references]
     photo = path if sighting.of_photograph else None
-    try:
-        shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ViewOptions(picture_px=_SIDE), "")
-    except MaskError:  # there is not a road in it
-        shown = None
+    views = ViewOptions(picture_px=_SIDE)
+    shown = Subject(location, sighting.mask, output_paths(folder, ""), photo=photo, indexes=indexes, views=views)
     picture = read_preview(path, _SIDE)[..., :3]
     (folder / PICTURE).write_bytes(encode(picture, Path(PICTURE).suffix, cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
-    view: dict[str, Any] = {"size": sighting.mask.shape[::-1], "roads": [], "place": None}
+    view: dict[str, Any] = {"size": shown.mask_size, "roads": [], "place": None}
     view["is_photograph"] = sighting.of_photograph
-    if shown is not None:
+    with suppress(MaskError):  # there is not a road in it
         view["roads"] = [_rounded(line, 1) for line in shown.lines]
-        view["place"] = None if shown.place is None else _show_place(folder, shown, shown.place)
+        view["place"] = _show_place(folder, shown) if shown.has_place else None
     if sighting.probability is not None:
         sighting.probability.write(folder / SEEN)
     (folder / VIEW).write_text(json.dumps(view, allow_nan=False), encoding="utf-8")
@@ -113,14 +112,15 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
 # --- the place --------------------------------------------------------------------------------------------------------
 
 
-def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
+def _show_place(folder: Path, shown: Subject) -> dict[str, Any]:
     """Return the layers on the map, in longitude and latitude, and draw the picture there."""
+    place = shown.place
 
     def lay(pixels: FloatArray) -> FloatArray:
         return to_lonlat(place.crs, place.to_crs(pixels))
 
     roads = [line for line in (lay(item) for item in shown.lines) if np.isfinite(line).all()]
-    matches, values = shown.matches(), []
+    matches, values = shown.largest_residuals(), []
     if matches is not None:
         seen, there = lay(plane_to_pixel(matches.query_xy)), to_lonlat(place.crs, matches.reference_xy)
         values = [
@@ -128,20 +128,20 @@ def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
             for a, b, residual in zip(seen, there, matches.residual_m, strict=True)
             if np.isfinite([*a, *b]).all()
         ]
-    outline = Frame(*shown.size).outline()
+    outline = Frame(*shown.mask_size).outline()
     return {
         "outline": _rounded(lay(np.vstack([outline, outline[:1]])), 7),
-        "warped": _draw_on_map(folder / WARPED, shown, place),
+        "warped": _draw_on_map(folder / WARPED, shown),
         "roads": [_rounded(line, 7) for line in roads],
         "matches": values,
     }
 
 
-def _draw_on_map(path: Path, shown: Shown, place: Placement) -> list[list[float]] | None:
+def _draw_on_map(path: Path, shown: Subject) -> list[list[float]] | None:
     """Draw the picture as web maps are drawn; return where its corners lie, from the top left; None where nowhere."""
-    _, *ways = choose_target(place, ImageOptions(crs=_WEB))
-    image = shown.draw_picture(_MASK_COLOR)
-    warped, grid = place.draw(image, shown.size, _MAP_SIDE**2, ways, smooth=shown.photograph is not None)
+    _, *ways = choose_target(shown.place, ImageOptions(crs=_WEB))
+    image, smooth = draw_picture(shown, rgb("query")), shown.photo is not None
+    warped, grid = shown.place.draw(image, shown.mask_size, _MAP_SIDE**2, ways, smooth)
     if grid.width == 0 or grid.width * grid.resolution > _WORLD_M / 4:
         return None
     path.write_bytes(encode(warped, path.suffix, cv2.IMWRITE_WEBP_QUALITY, _QUALITY))

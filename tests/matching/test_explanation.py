@@ -64,6 +64,12 @@ def lattice():
     return reference_of(build_network(ways, PLANE, {"name": "lattice"}))
 
 
+def subject(explanation, mask, town):
+    """What outputs show of an explanation, on one map."""
+    paths = output_paths("", "a")
+    return Subject(explanation.location, mask, paths, indexes=[town.index], explanation=explanation)
+
+
 def test_places_that_are_compared_to_be_shown_do_not_count_as_measured(lattice):
     """The funnel is that of the search, not of its explanation."""
     query, options = read_query(mask_of(lattice.network)), LocateOptions()
@@ -177,7 +183,7 @@ def test_too_few_intersections(town):
     assert search["starved_at"] == "intersections"
     assert search["funnel"]["intersections"] == 0
     assert search["missing"] == ["no intersections are seen, at least 1 is needed"]
-    assert draw_explanation(explanation, RoadMask(canvas > 0), town.index).shape[1] == 2000
+    assert draw_explanation(subject(explanation, RoadMask(canvas > 0), town)).shape[1] == 2000
 
 
 @pytest.mark.slow
@@ -188,7 +194,7 @@ def test_the_papers_method_tells_what_it_counts(town, mask):
     assert explanation.location.located
     assert search["places"] == search["missing"] == []
     assert search["funnel"]["intersections"] > 20
-    assert draw_explanation(explanation, mask, town.index).shape[1] == 2000
+    assert draw_explanation(subject(explanation, mask, town)).shape[1] == 2000
 
 
 def test_each_reference_has_its_story(town, mask, lattice):
@@ -200,7 +206,7 @@ def test_each_reference_has_its_story(town, mask, lattice):
 class TestPicture:
     @pytest.mark.slow
     def test_what_agrees_and_what_does_not(self, town, mask):
-        picture = draw_explanation(explain(mask, town), mask, town.index)
+        picture = draw_explanation(subject(explain(mask, town), mask, town))
         assert picture.dtype == np.uint8
         assert picture.shape[1:] == (2000, 3)
         assert (picture == rgb("agree")).all(axis=2).sum() > 500
@@ -209,8 +215,7 @@ class TestPicture:
     @pytest.mark.slow
     def test_the_stage_that_starved_is_marked(self, town, mask, tmp_path: Path):
         explanation = explain(mask, town, with_camera(gsd_m=(0.3, 0.7)))
-        subject = Subject(explanation.location, mask, output_paths(tmp_path, "a"), explanation=explanation)
-        write_explanation_picture(tmp_path / "a.png", replace(subject, indexes=[town.index]))
+        write_explanation_picture(tmp_path / "a.png", subject(explanation, mask, town))
         picture = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
         assert (explanation.stories[0].starved_at == "camera") == bool((picture == STARVED).all(axis=2).any())
 
@@ -220,7 +225,7 @@ class TestPicture:
         observed = np.ones(mask.shape, bool)
         observed[: size[1] // 2, : size[0] // 2] = False
         mask = RoadMask(mask.roads & observed, observed, "long.png")
-        assert draw_explanation(explain(mask, town), mask, town.index).shape[1] == 2000
+        assert draw_explanation(subject(explain(mask, town), mask, town)).shape[1] == 2000
 
 
 @pytest.mark.slow

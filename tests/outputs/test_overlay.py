@@ -12,9 +12,9 @@ from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.location import Location
+from roadgeo.location import Location, Seen
+from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.drawing.layers import rgb
-from roadgeo.outputs.drawing.views import Shown
 from roadgeo.outputs.overlay import MAP_PX, MASK_SHARE, draw_overlay, write_overlay
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.plot import draw_plot
@@ -39,16 +39,19 @@ def city() -> SimpleNamespace:
     )
 
 
-def subject() -> Subject:
+def shown(location: Location | None = None, mask: RoadMask | None = None, photo: Path | None = None) -> Subject:
     """What outputs show, on that map."""
-    return Subject(located(), road_mask(), output_paths("", "a"), indexes=[city()])
+    scene, graph = trace_query(road_mask())
+    location = replace(location or located(), seen=Seen(graph, scene.intersections.xy))
+    return Subject(location, mask or road_mask(), output_paths("", "a"), photo=photo, indexes=[city()])
 
 
-def shown(location: Location | None = None, mask: RoadMask | None = None, photo: np.ndarray | None = None) -> Shown:
-    """What pictures show, on that map."""
-    location, mask = location or located(), mask or road_mask()
-    of = Shown.of(replace(location, seen=None), road_mask(), city(), attribution="© them")
-    return replace(of, mask=mask, location=location, photograph=photo)
+def photograph(folder: Path, shape: tuple[int, int], shown_columns: int) -> Path:
+    """A green one, transparent behind some columns."""
+    picture = np.full((*shape, 4), (30, 200, 10, 255), np.uint8)
+    picture[:, shown_columns:, 3] = 0
+    cv2.imwrite(str(folder / "photo.png"), picture)
+    return folder / "photo.png"
 
 
 @pytest.mark.parametrize("truetype", LETTERS)
@@ -75,10 +78,10 @@ def test_a_location_without_evidence_is_drawn_without_matches() -> None:
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (400, 600), (900, 300)])
-def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(shape: tuple[int, int]) -> None:
-    photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8)
-    photo[:, shape[1] // 2 :, 3] = 0
-    with_it = draw_overlay(shown(photo=photo))
+def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(
+    shape: tuple[int, int], tmp_path: Path
+) -> None:
+    with_it = draw_overlay(shown(photo=photograph(tmp_path, shape, shape[1] // 2)))
     without = draw_overlay(shown())
     assert with_it.shape == without.shape
     green = np.argwhere((with_it == (10, 200, 30)).all(axis=2))
@@ -92,8 +95,10 @@ def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(sha
 
 @pytest.mark.parametrize("with_photo", [False, True])
 @pytest.mark.parametrize("shape", [(500, 500), (900, 300), (300, 900), (1, 1), (4000, 40), (40, 4000)])
-def test_nothing_is_drawn_over_the_title_or_the_legend(shape: tuple[int, int], with_photo: bool) -> None:
-    photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8) if with_photo else None
+def test_nothing_is_drawn_over_the_title_or_the_legend(
+    shape: tuple[int, int], with_photo: bool, tmp_path: Path
+) -> None:
+    photo = photograph(tmp_path, shape, shape[1]) if with_photo else None
     mask = RoadMask(np.ones(shape, np.bool_))
     picture = draw_overlay(shown(replace(located(), evidence=None), mask, photo))
     top, panel = round(MAP_PX * 0.075), round(MAP_PX * MASK_SHARE)
@@ -104,14 +109,13 @@ def test_nothing_is_drawn_over_the_title_or_the_legend(shape: tuple[int, int], w
 
 
 def test_the_photograph_of_a_result_is_drawn(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 60, 3), (30, 200, 10), np.uint8))
-    write_overlay(tmp_path / "a.png", replace(subject(), photo=tmp_path / "photo.png"))
+    write_overlay(tmp_path / "a.png", shown(photo=photograph(tmp_path, (40, 60), 60)))
     drawn = cv2.imread(str(tmp_path / "a.png"))
     assert (drawn == (30, 200, 10)).all(axis=2).sum() > 10_000
 
 
 def test_the_picture_is_written(tmp_path: Path) -> None:
-    write_overlay(tmp_path / "a.png", subject())
+    write_overlay(tmp_path / "a.png", shown())
     drawn = draw_overlay(shown())
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], drawn)
     with pytest.raises(OutputError, match="no place"):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from evaluation.test_report import answer, truth
-from outputs.test_report_pages import DEMO, rival
+from outputs.test_report_pages import DEMO, render_report, rival
 from support.browser import Browser, browser
 
 from roadgeo.evaluation.report import render_report as render_evaluation
@@ -17,7 +17,7 @@ from roadgeo.flights.report import Thumbnails, render_flight
 from roadgeo.flights.rows import Row
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.location import Location, Place, Reason
-from roadgeo.outputs.report import Entry, render_batch, render_report
+from roadgeo.outputs.report import Entry, render_batch
 from roadgeo.outputs.report.verification import write_verification
 from roadgeo.reference.reference import open_reference
 from roadgeo.sources.masks import read_mask

@@ -20,12 +20,13 @@ from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.location import Evidence, Location, Place, Reason
-from roadgeo.matching.index import build_index
+from roadgeo.matching.index import ReferenceIndex, build_index
 from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
-from roadgeo.outputs.drawing.views import ViewOptions
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
-from roadgeo.outputs.report import Entry, render_batch, render_report, write_batch
+from roadgeo.outputs.report import Entry, render_batch, write_batch
+from roadgeo.outputs.report.page import render_report as render_subject
+from roadgeo.outputs.subject import Subject, ViewOptions
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.network import build_network
 from roadgeo.sources.masks import read_mask
@@ -66,6 +67,20 @@ def rival(location: Location, dx: float = 400.0, dy: float = 400.0) -> Location:
     assert center is not None
     place = Place(center.x + dx, center.y + dy, center.lon + 0.004, center.lat + 0.004, 7.5)
     return replace(location, log10_odds=8.5, runner_up=place)
+
+
+def render_report(
+    location: Location,
+    mask: RoadMask,
+    index: ReferenceIndex,
+    attribution: str = "",
+    picture: Path | None = None,
+    options: ViewOptions | None = None,
+) -> str:
+    """Its page."""
+    index = replace(index, meta={**index.meta, "attribution": attribution})
+    views = options or ViewOptions()
+    return render_subject(Subject(location, mask, output_paths("", "a"), photo=picture, indexes=[index], views=views))
 
 
 class Reader(HTMLParser):

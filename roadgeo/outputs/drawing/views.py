@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
-from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.drawing.layers import (
     Arrows,
     Box,
@@ -28,12 +25,12 @@ from roadgeo.outputs.drawing.layers import (
     rgb,
 )
 from roadgeo.outputs.drawing.svg import join_segments, thin_lines
-from roadgeo.outputs.paths import Placement
+from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import write_sigma
 
 __all__ = [
-    "SIGMAS", "STILL", "Shown", "ViewOptions", "Window", "frame_layers", "map_layer", "mask_picture", "place_layers",
-    "touching", "whole_map",
+    "SIGMAS", "STILL", "Window", "draw_picture", "frame_layers", "map_layer", "mask_layer", "mask_picture",
+    "place_layers", "probability_layer", "touching", "whole_map",
 ]  # fmt: skip
 
 #: A circle that holds a corner's true position with 95 %, in rms distances.
@@ -45,144 +42,6 @@ STILL = ("ground", "map-roads", "query-roads", "footprint", "matches")
 _GREY: Color = (150, 155, 163)
 _PROBABLE: Color = (255, 210, 31)
 _UNKNOWN = 255  # in a map of probabilities
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """How much the views of a result hold.
-
-    Attributes
-    ----------
-    margin, reach : float
-        Ground shown around the footprint at first, and ground whose roads are there to be moved to, in lengths of the
-        footprint's longer side.
-    max_map_vertices, max_query_vertices : int
-        Vertices of the roads of the map, and of the mask.
-    max_matches : int
-        Those with the largest residuals are listed and drawn.
-    picture_px, picture_bytes : int
-        Longer side of the photograph or mask, and size of each of its two copies: in its frame and on the map.
-    overview_bytes : int
-        Size of the picture of the whole map.
-    """
-
-    margin: float = 0.12
-    reach: float = 0.7
-    max_map_vertices: int = 80_000
-    max_query_vertices: int = 25_000
-    max_matches: int = 1500
-    picture_px: int = 1400
-    picture_bytes: int = 300_000
-    overview_bytes: int = 150_000
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A result and its pictures.
-
-    Attributes
-    ----------
-    place : Placement or None
-        Where the mask lies, if anywhere.
-    lines : list of (V, 2)
-        The mask's roads, pixels.
-    seen : (N, 2) float64
-        Its intersections, pixels.
-    photograph : (h, w, 4) uint8 or None
-        Reduced.
-    """
-
-    location: Location
-    mask: RoadMask
-    index: ReferenceIndex
-    options: ViewOptions
-    place: Placement | None
-    lines: list[FloatArray]
-    seen: FloatArray
-    photograph: AnyArray | None
-    attribution: str
-
-    @classmethod
-    def of(
-        cls,
-        location: Location,
-        mask: RoadMask,
-        index: ReferenceIndex,
-        picture: str | os.PathLike[str] | None = None,
-        options: ViewOptions | None = None,
-        attribution: str = "",
-    ) -> Shown:
-        """Take the roads of the mask, or trace them again, and read the picture.
-
-        Raises
-        ------
-        MaskError
-            The picture cannot be read, or the mask shows no roads.
-        """
-        options, seen = options or ViewOptions(), location.seen
-        if seen is None:
-            scene, graph = trace_query(mask)
-            seen = Seen(graph, scene.intersections.xy)
-        lines = thin_lines([plane_to_pixel(line) for line in seen.graph.polylines()], options.max_query_vertices, 0.4)
-        photograph = None
-        if picture is not None:
-            from roadgeo.outputs.orthophoto import read_preview
-
-            photograph = read_preview(picture, options.picture_px)
-        place = None if location.homography is None else Placement.of(location)
-        crossings = plane_to_pixel(seen.xy)
-        return cls(location, mask, index, options, place, lines, crossings, photograph, attribution)
-
-    @property
-    def subject(self) -> str:
-        """Kind of the image, in words: "photograph" or "mask"."""
-        return "mask" if self.photograph is None and self.mask.probability is None else "photograph"
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the mask."""
-        return self.mask.shape[1], self.mask.shape[0]
-
-    @property
-    def box(self) -> Box:
-        """The frame."""
-        return 0.0, 0.0, float(self.size[0]), float(self.size[1])
-
-    def placed(self) -> Placement:
-        """Return the place.
-
-        Raises
-        ------
-        OutputError
-            The location has no place.
-        """
-        return self.place or Placement.of(self.location)
-
-    def matches(self) -> Evidence | None:
-        """Those with the largest residuals, in falling order."""
-        evidence = self.location.evidence
-        if evidence is None:
-            return None
-        first = np.argsort(-evidence.residual_m, kind="stable")[: self.options.max_matches]
-        picked = (evidence.query_xy[first], evidence.reference_xy[first], evidence.residual_m[first])
-        return Evidence(evidence.query_graph, *picked)
-
-    def runner_up(self) -> FloatArray | None:
-        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
-        other = self.location.runner_up if self.place else next(iter(self.location.alternatives), None)
-        return None if other is None else np.array([other.x, other.y])
-
-    def draw_picture(self, color: Color) -> AnyArray:
-        """Draw the photograph, or else the mask's roads in a colour: (h, w, 4) uint8."""
-        return mask_picture(self.mask, color, self.options.picture_px) if self.photograph is None else self.photograph
-
-    def probability(self) -> Picture | None:
-        """Return a segmenter's probability, lighter where higher; None without one."""
-        seen = self.mask.probability
-        if seen is None:
-            return None
-        image = _tinted(np.where(seen == _UNKNOWN, 0, seen).astype(np.uint8), _PROBABLE, self.options.picture_px)
-        return Picture(image, self.box, self.options.picture_bytes, lossless=True)
 
 
 @dataclass(frozen=True)
@@ -245,6 +104,12 @@ def touching(ends: AnyArray, low: FloatArray, high: FloatArray) -> BoolArray:
     return np.asarray((ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1))
 
 
+def draw_picture(subject: Subject, color: Color) -> AnyArray:
+    """Draw the photograph, or else the mask's roads in a colour: (h, w, 4) uint8."""
+    reduced = subject.reduced
+    return mask_picture(subject.mask, color, subject.views.picture_px) if reduced is None else reduced
+
+
 def mask_picture(mask: RoadMask, color: Color, side: int) -> AnyArray:
     """Draw a mask's roads in a colour, and unobserved ground in grey: (h, w, 4) uint8, at most `side` pixels."""
     image = _tinted(mask.roads.view(np.uint8) * np.uint8(255), color, side)
@@ -252,6 +117,11 @@ def mask_picture(mask: RoadMask, color: Color, side: int) -> AnyArray:
         unseen = cv2.resize((~mask.observed).view(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         image[unseen > 0] = (*_GREY, 60)
     return image
+
+
+def mask_layer(subject: Subject) -> Layer:
+    """Return the mask alone, whatever photograph it was made of."""
+    return Layer("picture", "", [Picture(mask_picture(subject.mask, _GREY, subject.views.picture_px), subject.box)])
 
 
 def _tinted(opacity: AnyArray, color: Color, side: int) -> AnyArray:
@@ -268,19 +138,16 @@ def _tinted(opacity: AnyArray, color: Color, side: int) -> AnyArray:
 # --- the frame --------------------------------------------------------------------------------------------------------
 
 
-def frame_layers(subject: Shown) -> list[Layer]:
+def frame_layers(subject: Subject) -> list[Layer]:
     """Return the mask, or its photograph, with the roads and intersections seen in it; in its pixels."""
-    is_photograph = subject.photograph is not None
-    image = subject.draw_picture(_GREY)
-    picture = Picture(image, subject.box, subject.options.picture_bytes, lossless=not is_photograph)
-    matches = subject.matches()
+    matches = subject.largest_residuals()
     matched = np.empty((0, 2)) if matches is None else plane_to_pixel(matches.query_xy)
     taken = set(map(tuple, matched.tolist()))
-    others = np.array([xy for xy in subject.seen.tolist() if tuple(xy) not in taken]).reshape(-1, 2)
-    others = others[: subject.options.max_query_vertices // 4]
+    others = np.array([xy for xy in subject.crossings.tolist() if tuple(xy) not in taken]).reshape(-1, 2)
+    others = others[: subject.views.max_query_vertices // 4]
     called = "other intersections" if len(matched) else "its intersections"
     return [
-        Layer("picture", "photograph" if is_photograph else "mask", [picture]),
+        _picture_layer(subject, draw_picture(subject, _GREY), subject.box),
         Layer("query-roads", "its roads", [Lines(subject.lines)]),
         Layer("unmatched", called, [Dots(others, hollow=True)]),
         Layer("matches", "matched", [Dots(matched)]),
@@ -288,31 +155,48 @@ def frame_layers(subject: Shown) -> list[Layer]:
     ]
 
 
+def _picture_layer(subject: Subject, image: AnyArray, box: Box) -> Layer:
+    """Return the photograph, or the mask, where a box says."""
+    is_photograph = subject.photo is not None
+    picture = Picture(image, box, subject.views.picture_bytes, lossless=not is_photograph)
+    return Layer("picture", "photograph" if is_photograph else "mask", [picture])
+
+
+def probability_layer(subject: Subject) -> list[Layer]:
+    """Return a segmenter's probability, lighter where higher; nothing without one."""
+    seen, views = subject.mask.probability, subject.views
+    if seen is None:
+        return []
+    image = _tinted(np.where(seen == _UNKNOWN, 0, seen).astype(np.uint8), _PROBABLE, views.picture_px)
+    picture = Picture(image, subject.box, views.picture_bytes, lossless=True)
+    return [Layer("probability", "probability of road", [picture], shown=False)]
+
+
 # --- the place --------------------------------------------------------------------------------------------------------
 
 
-def place_layers(subject: Shown, place: Placement, window: Window) -> list[Layer]:
+def place_layers(subject: Subject, window: Window) -> list[Layer]:
     """Return the map around a footprint, and the footprint on it; in the frame of a window."""
-    location, options = subject.location, subject.options
-    wide = Window.around(place.footprint, options.reach, subject.runner_up())
+    place, views = subject.place, subject.views
+    wide = Window.around(place.footprint, views.reach, subject.runner_up())
     crossings = subject.index.plane.to_crs(subject.index.xy)
-    crossings = window.place(crossings[wide.holds(crossings)][: options.max_map_vertices // 4])
+    crossings = window.place(crossings[wide.holds(crossings)][: views.max_map_vertices // 4])
     corners = window.place(place.footprint)
     lines = [line for line in (window.place(place.to_crs(road)) for road in subject.lines) if np.isfinite(line).all()]
     layers = [
         Layer("ground", "", [Ring(corners)]),
-        *_picture_on_map(subject, place, window),
-        map_layer(subject.index, window, wide, options.max_map_vertices),
+        *_picture_on_map(subject, window),
+        map_layer(subject.index, window, wide, views.max_map_vertices),
         Layer("unmatched", "intersections of the map", [Dots(crossings, hollow=True)], shown=False),
-        Layer("query-roads", f"roads of the {subject.subject}", [Lines(lines)]),
+        Layer("query-roads", f"roads of the {subject.kind}", [Lines(lines)]),
         Layer("footprint", "footprint", [Ring(corners, up=True)]),
     ]
-    matches = subject.matches()
+    matches = subject.largest_residuals()
     if matches is not None:
         at, found = window.place(matches.reference_xy), window.place(place.to_crs(plane_to_pixel(matches.query_xy)))
         layers.append(Layer("residuals", "residuals", [Arrows(at, found - at)]))
         layers.append(Layer("matches", "matched intersections", [Dots(at)]))
-    sigma = location.corner_sigma_m
+    sigma = subject.location.corner_sigma_m
     if sigma is not None:
         texts = list(map(write_sigma, sigma.tolist()))
         layers.append(Layer("sigma", "corners, 95 %", [Circles(corners, SIGMAS * sigma, texts)]))
@@ -328,16 +212,15 @@ def map_layer(index: ReferenceIndex, window: Window, wide: Window, max_vertices:
     return Layer("map-roads", "roads of the map", [Lines(thin_lines(roads, max_vertices))])
 
 
-def _picture_on_map(subject: Shown, place: Placement, window: Window) -> list[Layer]:
+def _picture_on_map(subject: Subject, window: Window) -> list[Layer]:
     """Return the photograph, or the mask's roads, warped to where it lies; nothing where that cannot be drawn."""
-    image, is_photograph = subject.draw_picture(rgb("query")), subject.photograph is not None
-    warped, grid = place.draw(image, subject.size, subject.options.picture_px**2, smooth=is_photograph)
+    image, is_photograph = draw_picture(subject, rgb("query")), subject.photo is not None
+    warped, grid = subject.place.draw(image, subject.mask_size, subject.views.picture_px**2, smooth=is_photograph)
     if grid.width == 0:
         return []
     x, y = window.place(np.array([grid.west, grid.north])).tolist()
     box = (x, y, grid.width * grid.resolution, grid.height * grid.resolution)
-    picture = Picture(warped, box, subject.options.picture_bytes, lossless=not is_photograph)
-    return [Layer("picture", "photograph" if is_photograph else "mask", [picture], shown=is_photograph)]
+    return [replace(_picture_layer(subject, warped, box), shown=is_photograph)]
 
 
 # --- the whole map ----------------------------------------------------------------------------------------------------

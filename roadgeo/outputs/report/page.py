@@ -9,7 +9,6 @@ from __future__ import annotations
 import html
 import json
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import numpy as np
 from roadgeo import __version__
 from roadgeo._text import counted
 from roadgeo.geometry.frame import polygon_area
-from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import transform
 from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.index import ReferenceIndex
@@ -26,15 +25,13 @@ from roadgeo.outputs.drawing.layers import Cross, Layer, Ring
 from roadgeo.outputs.drawing.svg import draw_layer, stylesheet
 from roadgeo.outputs.drawing.views import (
     SIGMAS,
-    Shown,
-    ViewOptions,
     Window,
     frame_layers,
     place_layers,
+    probability_layer,
     whole_map,
 )
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
-from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.report.viewer import draw_viewer, frame_data, window_data
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat, write_distance, write_lead, write_sigma
@@ -68,52 +65,35 @@ _ARROW_PX, _CIRCLE_PX = 26.0, 60.0
 
 def write_report(path: Path, subject: Subject) -> None:
     """Write `render_report`."""
-    page = render_report(subject.location, subject.mask, subject.index, subject.attribution, subject.photo)
-    path.write_text(page, encoding="utf-8", newline="\n")
+    path.write_text(render_report(subject), encoding="utf-8", newline="\n")
 
 
-def render_report(
-    location: Location,
-    mask: RoadMask,
-    index: ReferenceIndex,
-    attribution: str = "",
-    picture: str | os.PathLike[str] | None = None,
-    options: ViewOptions | None = None,
-) -> str:
+def render_report(subject: Subject) -> str:
     """Render what became of a mask, located or not, as a whole HTML page.
-
-    Parameters
-    ----------
-    index : ReferenceIndex
-        The map that it lies on, or one that was searched.
-    attribution : str
-        Whom the map's licence asks to name.
-    picture : path, optional
-        The photograph that the mask was made of: the same frame at any scale.
 
     Raises
     ------
     MaskError
         The picture cannot be read, or the mask shows no roads.
     """
-    subject = Shown.of(location, mask, index, picture, options, attribution)
-    place = subject.place
-    views = [_draw_frame(subject)] if place is None else [_draw_place(subject, place), _draw_frame(subject)]
+    location = subject.location
+    views = [*([_draw_place(subject)] if subject.has_place else []), _draw_frame(subject)]
     parts = [
         _explain(subject),
-        section(f"In the {subject.subject}", "".join(views[1:])),
+        section(f"In the {subject.kind}", "".join(views[1:])),
         section("Where on the map", _draw_overview(subject)),
         section("Numbers", table(_numbers(subject))),
-        "" if place is None else section("Corners", _corners(subject, place)),
+        section("Corners", _corners(subject)) if subject.has_place else "",
         section("Matched intersections", _matches(subject)),
         f"<details><summary>Everything else</summary>{table(_details(subject))}</details>",
+        footer(subject.attribution),
     ]
     name = bare_name(location.query) or "mask"
     header = (
         f'<h1>{html.escape(name)}</h1><span class="status {location.status}">{STATUS[location.status]}</span>'
         f"<p>{html.escape(_sentence(without_folders(location.reason, location.query)))}</p>"
     )
-    return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}{footer(attribution)}</aside></main>")
+    return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
 
 
 def render_page(title: str, header: str, body: str) -> str:
@@ -163,27 +143,30 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 # --- views ------------------------------------------------------------------------------------------------------------
 
 
-def _draw_frame(subject: Shown) -> str:
+def _draw_frame(subject: Subject) -> str:
     """Draw the mask, or its photograph, with the roads and intersections seen in it: an HTML figure."""
-    layers, probable = frame_layers(subject), subject.probability()
-    if probable is not None:
-        layers.insert(1, Layer("probability", "probability of road", [probable], shown=False))
-    text = f"The {subject.subject} {bare_name(subject.location.query)}, with the roads and intersections seen in it"
+    picture, *marks = frame_layers(subject)
+    layers = [picture, *probability_layer(subject), *marks]
+    text = f"The {subject.kind} {bare_name(subject.location.query)}, with the roads and intersections seen in it"
     return draw_viewer(text, subject.box, layers, frame_data(subject.box, _MASK_PX))
 
 
-def _draw_place(subject: Shown, place: Placement) -> str:
+def _draw_place(subject: Subject) -> str:
     """Draw the map around a footprint, and the footprint on it: an HTML figure."""
-    window = Window.around(place.footprint, subject.options.margin, subject.runner_up())
+    window = _window(subject)
     arrows, per_px = _arrow_scale(subject.location), window.width / _PLACE_PX
     data = window_data(window, _PLACE_PX) | {
-        "data-homography": json.dumps((window.matrix() @ place.homography).tolist()),
+        "data-homography": json.dumps((window.matrix() @ subject.place.homography).tolist()),
         "data-arrows": f"{arrows:.4g}",
     }
     data["style"] += f";--k:{max(1.0, arrows * per_px):.4g}"
-    location, layers = subject.location, place_layers(subject, place, window)
+    location, layers = subject.location, place_layers(subject, window)
     text = f"Map, north up: the footprint of {bare_name(location.query)} over the roads of {location.reference}"
     return draw_viewer(text, window.box, layers, data, scale=True, enlarged=True, credit=subject.attribution)
+
+
+def _window(subject: Subject) -> Window:
+    return Window.around(subject.place.footprint, subject.views.margin, subject.runner_up())
 
 
 def _arrow_scale(location: Location) -> float:
@@ -197,24 +180,24 @@ def _arrow_scale(location: Location) -> float:
     return min(scales)
 
 
-def _draw_overview(subject: Shown) -> str:
+def _draw_overview(subject: Subject) -> str:
     """Draw all of the map, and where on it the mask and the runner-up lie."""
     index, location = subject.index, subject.location
     if index.name != location.reference:  # several were searched
         return f"<p>Searched: {html.escape(location.reference)}.</p>"
-    picture, window = whole_map(index, subject.options.overview_bytes, 2 * _OVERVIEW_PX)
+    picture, window = whole_map(index, subject.views.overview_bytes, 2 * _OVERVIEW_PX)
     layers = [picture]
-    if subject.place is not None:
+    if subject.has_place:
         layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
     known = [place.footprint_lonlat for place in location.alternatives if place.footprint_lonlat is not None]
     grounds = [transform("EPSG:4326", index.plane.crs, np.array(ring)) for ring in known]
     others: list[Cross | Ring] = [Ring(window.place(ground)) for ground in grounds if np.isfinite(ground).all()]
     middle = subject.runner_up()
     if middle is not None:
-        others.append(Cross(window.place(middle), "runner-up" if subject.place else "best"))
+        others.append(Cross(window.place(middle), "runner-up" if subject.has_place else "best"))
     if others:
         layers.append(Layer("runner-up", "", others))
-    text = f"All of the map {index.name}" + (", with the footprint" if subject.place else "")
+    text = f"All of the map {index.name}" + (", with the footprint" if subject.has_place else "")
     box = " ".join(f"{value:.0f}" for value in window.box)
     return (
         f'<svg class="overview" viewBox="{box}" role="img" aria-label="{html.escape(text)}" '
@@ -227,7 +210,7 @@ def _draw_overview(subject: Shown) -> str:
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def _explain(subject: Shown) -> str:
+def _explain(subject: Subject) -> str:
     """Return the meaning of the answer, and the advice where there is no place: HTML."""
     location = subject.location
     if location.status == "located":
@@ -239,13 +222,13 @@ def _explain(subject: Shown) -> str:
     elif location.reason_code is Reason.HALF_A_PLACE:
         texts = [
             "The place is known in one direction only. Nothing was georeferenced; shown is the likeliest.",
-            f"A {subject.subject} of more ground, with roads in other directions, would tell where along them it lies.",
+            f"A {subject.kind} of more ground, with roads in other directions, would tell where along them it lies.",
         ]
     elif location.status == "ambiguous":
         texts = [
             "Two places fit, and which one is right cannot be told. Nothing was georeferenced; shown is the better.",
             _rival(location),
-            f"A {subject.subject} of more ground, or a hint (--near, --gsd, --north-up), may decide between them.",
+            f"A {subject.kind} of more ground, or a hint (--near, --gsd, --north-up), may decide between them.",
             _TAKING,
         ]
     else:
@@ -253,9 +236,9 @@ def _explain(subject: Shown) -> str:
     return "".join(f"<p>{text}</p>" for text in texts if text)
 
 
-def _advice(subject: Shown) -> list[str]:
+def _advice(subject: Subject) -> list[str]:
     """Return what to look at where nothing was found: HTML."""
-    location, called = subject.location, subject.subject
+    location, called = subject.location, subject.kind
     n, places = location.n_intersections, location.alternatives
     few = f": few. {_FEW} or more, of more ground, would help" if n < _FEW else ""
     return [
@@ -297,11 +280,11 @@ def _sentence(text: str) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def _numbers(subject: Shown) -> list[tuple[str, str]]:
+def _numbers(subject: Subject) -> list[tuple[str, str]]:
     """Label and value (HTML) of the main results."""
     # The place and the camera, where they are known.
-    location, place = subject.location, subject.place
-    width, height = subject.size
+    location, place = subject.location, subject.place if subject.has_place else None
+    width, height = subject.mask_size
     frame = f"{width} × {height} pixels"
     rows = []
     if place is not None and location.center is not None:
@@ -336,11 +319,10 @@ def _link(place: Place) -> str:
     return f"{where}<br><small>{place.x:,.1f}, {place.y:,.1f}</small>"
 
 
-def _corners(subject: Shown, place: Placement) -> str:
+def _corners(subject: Subject) -> str:
     """List the corners, each with a button that shows it on the map."""
-    location = subject.location
-    window = Window.around(place.footprint, subject.options.margin, subject.runner_up())
-    positions = window.place(place.footprint)
+    location, place = subject.location, subject.place
+    positions = _window(subject).place(place.footprint)
     lonlat = np.full((4, 2), np.nan) if location.footprint_lonlat is None else location.footprint_lonlat
     sigma = np.full(4, np.nan) if location.corner_sigma_m is None else location.corner_sigma_m
     rows = []
@@ -354,9 +336,9 @@ def _corners(subject: Shown, place: Placement) -> str:
     return f'<table>{"".join(rows)}</table><p class="faint">Metres in {html.escape(crs)}</p>'
 
 
-def _matches(subject: Shown) -> str:
+def _matches(subject: Subject) -> str:
     """List the matches; the page's script takes their positions from here."""
-    matches = subject.matches()
+    matches = subject.largest_residuals()
     if matches is None or len(matches.residual_m) == 0:
         return ""
     pixels = plane_to_pixel(matches.query_xy)
@@ -378,7 +360,7 @@ def _matches(subject: Shown) -> str:
     )
 
 
-def _details(subject: Shown) -> list[tuple[str, str]]:
+def _details(subject: Subject) -> list[tuple[str, str]]:
     """Label and value (HTML) of everything else, for those who want to check."""
     location = subject.location
     plain = location.to_dict()
