@@ -20,7 +20,6 @@ from qgis.core import (
     QgsProcessingUtils,
     QgsProject,
     QgsRasterLayer,
-    QgsRectangle,
     QgsWkbTypes,
 )
 from qgis.gui import QgsRubberBand
@@ -43,9 +42,9 @@ from qgis.PyQt.QtWidgets import (
 from qgis.utils import iface
 
 from .canvases import Side
-from .refit import FEWEST, Fit, Match, fit, format_points, place, read_points, rms
+from .refit import FEWEST, Fit, Match, corners, fit, format_points, place, read_points, rms
 from .session import PICTURE_KEPT, POINTS_KEPT
-from .window import open_dialog
+from .window import open_dialog, show_points
 
 __all__ = ["MatchDock"]
 
@@ -223,15 +222,10 @@ class MatchDock(QDockWidget):
     def _zoom(self) -> None:
         """Show all points on the map; without any, the extent of the window's map."""
         if self.matches:
-            extent = QgsRectangle()
-            extent.setMinimal()
-            for match in self.matches:
-                extent.combineExtentWith(match.x, match.y)
-            extent.scale(1.3)
-            self.canvas.setExtent(extent)
+            show_points(self.canvas, [QgsPointXY(match.x, match.y) for match in self.matches])
         else:
             self.canvas.setExtent(iface.mapCanvas().extent())
-        self.canvas.refresh()
+            self.canvas.refresh()
 
     # --- changing -----------------------------------------------------------------------------------------------------
 
@@ -362,9 +356,7 @@ class MatchDock(QDockWidget):
         """Return the picture's corners on the map; none without a fit."""
         if self.found.matrix is None:
             return []
-        width, height = self.size
-        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
-        return [(float(x), float(y)) for x, y in place(self.found.matrix, corners)]
+        return [(float(x), float(y)) for x, y in place(self.found.matrix, corners(*self.size))]
 
     # --- exporting ----------------------------------------------------------------------------------------------------
 

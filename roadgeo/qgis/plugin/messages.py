@@ -11,7 +11,7 @@ from qgis.PyQt.QtGui import QDesktopServices
 from qgis.utils import plugins
 
 from .places import PlacesDialog
-from .refit import Match, fit, format_points
+from .refit import Match, corners, fit, format_points
 from .session import Finding
 from .window import keep, open_dialog, push, zoom
 
@@ -65,8 +65,7 @@ def _mend(finding: Finding) -> None:
     points, location = finding.points, finding.location
     if not points:
         points = QgsProcessingUtils.generateTempFilename(f"{finding.name}.points")
-        width, height = location["size"]
-        corners = zip(((0, 0), (width, 0), (width, height), (0, height)), location["footprint"])  # noqa: B905
-        matches = [Match(float(column), float(row), x, y) for (column, row), (x, y) in corners]
+        pixels = corners(*location["size"]).tolist()
+        matches = [Match(*pixel, *there) for pixel, there in zip(pixels, location["footprint"])]  # noqa: B905
         Path(points).write_text(format_points(location["crs"], matches, fit(matches)), "utf-8")
     _menu().mend(finding.picture, points)

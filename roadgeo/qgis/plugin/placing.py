@@ -16,7 +16,7 @@ from qgis.core import (
     QgsRasterLayer,
 )
 
-from .refit import FEWEST, fit, place, read_points, rms
+from .refit import FEWEST, corners, fit, place, read_points, rms
 
 __all__ = ["make_location"]
 
@@ -39,8 +39,7 @@ def make_location(picture: str, points: str) -> tuple[dict[str, Any], float]:
     if not crs.isValid():
         raise QgsProcessingException(f"{points}: does not say in which CRS its points are")
     width, height = layer.width(), layer.height()
-    corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
-    frame = np.array([*corners, (width / 2, height / 2), (width / 2, 0.0)])
+    frame = np.array([*corners(width, height), (width / 2, height / 2), (width / 2, 0.0)])
     there = place(found.matrix, frame).tolist()
     spots = [QgsPointXY(*spot) for spot in there]
     transform = QgsCoordinateTransform(crs, QgsCoordinateReferenceSystem("EPSG:4326"), QgsProject.instance())

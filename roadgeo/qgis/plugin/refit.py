@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["FEWEST", "Fit", "Match", "fit", "format_points", "place", "read_points", "rms"]
+__all__ = ["FEWEST", "Fit", "Match", "corners", "fit", "format_points", "place", "read_points", "rms"]
 
 #: Points that a homography needs.
 FEWEST = 4
@@ -114,6 +114,11 @@ def fit(matches: Sequence[Match]) -> Fit:
         return nothing
     matrix = np.linalg.inv(from_target) @ matrix @ from_source
     return Fit(matrix / matrix[2, 2], np.hypot(*(place(matrix, pixels) - ground).T).tolist())
+
+
+def corners(width: float, height: float) -> np.ndarray:
+    """Return the corners (4, 2) of a picture, from its top left one clockwise."""
+    return np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
 
 
 def place(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from qgis.utils import iface
 
 from .library import LONLAT
 
-__all__ = ["OPEN", "keep", "open_dialog", "push", "to_map", "zoom"]
+__all__ = ["OPEN", "keep", "open_dialog", "push", "show_points", "to_map", "zoom"]
 
 #: Dialogs that are open, which Python would let go of.
 OPEN: list[Any] = []
@@ -45,10 +45,15 @@ def push(title: str, text: str, offered: dict[str, Any], level: Any, lasts_s: in
 
 def zoom(lonlat: Iterable[Iterable[float]], scale: float = 1.3) -> None:
     """Show points of longitude and latitude on the window's map."""
-    canvas, extent = iface.mapCanvas(), QgsRectangle()
+    show_points(iface.mapCanvas(), [to_map(*point) for point in lonlat], scale)
+
+
+def show_points(canvas: Any, points: Iterable[Any], scale: float = 1.3) -> None:
+    """Show points in a canvas's own CRS on it, with some ground around them."""
+    extent = QgsRectangle()
     extent.setMinimal()
-    for point in lonlat:
-        extent.combineExtentWith(to_map(*point))
+    for point in points:
+        extent.combineExtentWith(point)
     extent.scale(scale)
     canvas.setExtent(extent)
     canvas.refresh()
