@@ -208,19 +208,12 @@ const far = (one, other) => Math.hypot(one.clientX - other.clientX, one.clientY 
 
 // --- mask and map
 
-function project(matrix, { x, y }) {
-  const [u, v, w] = matrix.map((row) => row[0] * x + row[1] * y + row[2]);
-  return w > 0 ? { x: u / w, y: v / w } : null;
-}
+// A homography as a matrix of space that leaves z alone.
+const inSpace = ([[a, b, c], [d, e, f], [g, h, i]]) => new DOMMatrix([a, d, 0, g, b, e, 0, h, 0, 0, 1, 0, c, f, 0, i]);
 
-function inverse([[a, b, c], [d, e, f], [g, h, i]]) {
-  const rows = [
-    [e * i - f * h, c * h - b * i, b * f - c * e],
-    [f * g - d * i, a * i - c * g, c * d - a * f],
-    [d * h - e * g, b * g - a * h, a * e - b * d],
-  ];
-  const det = a * rows[0][0] + b * rows[1][0] + c * rows[2][0];
-  return rows.map((row) => row.map((value) => value / det));
+function project(matrix, point) {
+  const { x, y, w } = matrix.transformPoint(point);
+  return w > 0 ? { x: x / w, y: y / w } : null;
 }
 
 // Show the ground under the pointer in the other view too.
@@ -269,8 +262,8 @@ for (const match of matches) match.row.querySelector("button").addEventListener(
 const ways = {};
 const linked = document.querySelector("svg[data-homography]");
 if (linked) {
-  ways.maskmap = JSON.parse(linked.dataset.homography);
-  ways.mapmask = inverse(ways.maskmap);
+  ways.maskmap = inSpace(JSON.parse(linked.dataset.homography));
+  ways.mapmask = ways.maskmap.inverse();
 }
 
 for (const button of document.querySelectorAll("button[data-x]")) {
