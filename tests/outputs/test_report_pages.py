@@ -228,7 +228,7 @@ def test_a_mask_is_traced_once(
     porto: Reference, drone: RoadMask, found: Location, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     anew = render_report(replace(found, seen=None), drone, porto.index)
-    monkeypatch.setattr("roadgeo.outputs.drawing.views.trace_query", None)
+    monkeypatch.setattr("roadgeo.outputs.subject.trace_query", None)
     assert render_report(found, drone, porto.index) == anew
 
 
