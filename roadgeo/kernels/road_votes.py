@@ -178,7 +178,6 @@ def vote(
     least: int,
     places: Places,
     votes: Floats2,
-    kept: int,
 ) -> tuple[int, int]:
     """Compare the roads around a query intersection with the roads around map intersections; keep the best.
 
@@ -201,15 +200,14 @@ def vote(
     least : int
         Scales at which fewer points are in reach are left out.
     votes : (K, 4) float64
-        (map intersection, turn in radians, scale, standard deviations). The first `kept` rows are a heap, worst first,
-        and the rows filled are a heap again afterwards.
+        (map intersection, turn in radians, scale, standard deviations): the rows filled are a heap, worst first.
 
     Returns
     -------
     int, int
-        `kept` now, and how many places and turns were tried.
+        How many rows are filled, and how many places and turns were tried.
     """
-    n_scales, tried = scales.shape[0], 0
+    n_scales, tried, kept = scales.shape[0], 0, 0
     n_points, points_of = np.zeros(n_scales), np.empty((n_scales, WORDS), np.int16)
     for s in range(n_scales):
         for w in range(WORDS):
@@ -238,16 +236,8 @@ def vote(
             back = -_bearing(turns[t] + (1 << (_BITS - 1)))
             for w in range(WORDS):
                 here[w] = turn_bits(places.rings[j, w], back)
-            best, where = votes[0, 3] if kept == votes.shape[0] else 0.0, -1
-            for s in range(n_scales):
-                if n_points[s] < least:
-                    continue
-                met = np.uint64(0)
-                for w in range(WORDS):
-                    met += count_bits(here[w] & points[s, w])
-                beyond = (met - expected[s]) * per_sigma[s]
-                if beyond > best:
-                    best, where = beyond, s
+            worst = votes[0, 3] if kept == votes.shape[0] else 0.0
+            best, where = _best_scale(here, points, n_points, least, expected, per_sigma, worst)
             if where >= 0:
                 slot = kept if kept < votes.shape[0] else 0  # the next free slot, or the worst vote's
                 kept = min(kept + 1, votes.shape[0])
@@ -255,6 +245,30 @@ def vote(
                 votes[slot, 3] = best
                 _sift(votes, slot, kept)
     return kept, tried
+
+
+@kernel(forceinline=True)
+def _best_scale(
+    here: NDArray[np.uint64],
+    points: UInt64s2,
+    n_points: NDArray[np.float64],
+    least: int,
+    expected: NDArray[np.float64],
+    per_sigma: NDArray[np.float64],
+    worst: float,
+) -> tuple[float, int]:
+    """Return the best score above `worst` of the points on the roads `here`, and its scale; -1 if no scale has one."""
+    best, where = worst, -1
+    for s in range(points.shape[0]):
+        if n_points[s] < least:
+            continue
+        met = np.uint64(0)
+        for w in range(WORDS):
+            met += count_bits(here[w] & points[s, w])
+        beyond = (met - expected[s]) * per_sigma[s]
+        if beyond > best:
+            best, where = beyond, s
+    return best, where
 
 
 @kernel()

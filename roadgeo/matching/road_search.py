@@ -245,7 +245,7 @@ class Voter:
         found = np.empty((_KEPT, 4))
         kept, tried = vote(
             self.candidates, rays, _TOLERANCE, turn, max_off, self.scales, points,
-            _LEAST_POINTS, self.places, found, 0,
+            _LEAST_POINTS, self.places, found,
         )  # fmt: skip
         wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, _TRIAL)
