@@ -152,7 +152,7 @@ class Hazard:
 def hazardous(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> Outcome:
     patch.setattr("roadgeo.running.queries.open_mask", Hazard())
     work = Locating((), str(folder), BatchOptions(), say_nothing)
-    return work.do(Task(f"{kind}.png", kind), Asked([], [], 0.0, {}))
+    return work.do(Task(f"{kind}.png", kind), Asked([], 0.0, {}))
 
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
