@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
+from worlds.demo import DRONE
+from worlds.rasters import write_raster
 
 import roadgeo
 from roadgeo.api import _is_place
 from roadgeo.errors import MaskError, NotLocatedError
-from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, ROADS
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.triples import Sweep, TripleOptions
 from roadgeo.reference.files import reference_digest
 from roadgeo.sources.roads import read_roads
 
-DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 QUICK = LocateOptions(effort="quick")
 
 pytestmark = pytest.mark.slow
@@ -48,10 +49,7 @@ def picture(kind: str, folder: Path) -> object:
         array = pytest.importorskip("xarray").DataArray
         return array(colours.transpose(2, 1, 0), dims=("band", "x", "y"))
     if kind == "rasterio":
-        profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": rows.shape[0], "width": rows.shape[1]}
-        with rasterio.open(folder / "a.tif", "w", transform=rasterio.Affine.scale(2), **profile) as dataset:
-            dataset.write(rows, 1)
-        return rasterio.open(folder / "a.tif")
+        return rasterio.open(write_raster(folder / "a.tif", rows, transform=rasterio.Affine.scale(2)))
     shapes = {"HW": rows > 127, "HWC": colours, "CHW": colours.transpose(2, 0, 1), "1HW": rows[None]}
     return {"text": str(DRONE), "path": DRONE, **shapes}[kind]
 

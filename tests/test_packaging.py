@@ -7,10 +7,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from worlds.demo import DRONE
 
 import roadgeo
 from roadgeo.errors import how_to_install, name_package
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -93,16 +94,15 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.slow
 def test_an_onboard_computer_locates_and_names_what_is_missing(porto: Path, tmp_path: Path) -> None:
     """A reference that was built elsewhere is all it needs."""
-    drone = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-c", ON_BOARD_ALONE, *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
 
     for arguments in (
-        ["locate", drone, "-r", porto, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
-        ["locate", drone, "-r", porto, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
-        ["vectorize", drone],
+        ["locate", DRONE, "-r", porto, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
+        ["locate", DRONE, "-r", porto, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
+        ["vectorize", DRONE],
         ["info", porto],
     ):
         done = run(*arguments)

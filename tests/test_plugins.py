@@ -15,11 +15,12 @@ import pytest
 import shapely
 from outputs.test_location_files import located, road_mask
 from scipy.spatial.transform import Rotation
+from worlds.demo import MASKS
 
 from roadgeo import plugins
 from roadgeo.cli import main
 from roadgeo.errors import MaskError, PluginError
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs import registry
@@ -31,7 +32,7 @@ from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import fetch_roads, read_roads
 
 ROOT = Path(__file__).parent.parent
-SHEET = next(mask.path for mask in demo_masks() if mask.path.stem == "map_sheet")
+SHEET = MASKS["map_sheet"].path
 
 
 @pytest.fixture

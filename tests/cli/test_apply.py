@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from worlds.demo import DRONE
 
 from roadgeo.cli import main
 from roadgeo.errors import MaskError
-from roadgeo.evaluation.demo import PHOTO, demo_masks
+from roadgeo.evaluation.demo import PHOTO
 from roadgeo.running.applying import read_location
 
 CORNERS = np.array([[0.0, 0.0], [1280.0, 0.0], [1280.0, 960.0], [0.0, 960.0]])
-DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")

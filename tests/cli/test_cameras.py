@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.demo import DRONE
+from worlds.rasters import write_raster
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pose import turned
 from roadgeo.geometry.projection import LocalPlane, grid_north
-
-DRONE = next(mask for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")
@@ -21,12 +20,10 @@ def folder(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     import rasterio
 
     folder = tmp_path_factory.mktemp("cameras")
-    place = rasterio.Affine(0.001, 0, -8.7, 0, -0.001, 41.2)
-    profile = {"driver": "GTiff", "width": 200, "height": 200, "count": 1, "dtype": "float32", "nodata": -9999}
-    with rasterio.open(folder / "dem.tif", "w", crs="EPSG:4326", transform=place, **profile) as dem:
-        dem.write(np.full((200, 200), 90.0, np.float32), 1)
+    place = {"crs": "EPSG:4326", "transform": rasterio.Affine(0.001, 0, -8.7, 0, -0.001, 41.2), "nodata": -9999}
+    write_raster(folder / "dem.tif", np.full((200, 200), 90.0, np.float32), **place)
     given = ["-r", str(porto), "--dem", str(folder / "dem.tif"), "--effort", "quick", "-q"]
-    assert main(["locate", str(DRONE.path), "-o", str(folder), *given]) == 0
+    assert main(["locate", str(DRONE), "-o", str(folder), *given]) == 0
     return folder
 
 
@@ -64,6 +61,6 @@ def test_the_camera_and_the_homography_see_the_same(folder: Path) -> None:
 def test_a_terrain_model_without_a_place_is_refused(
     porto: Path, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["-r", str(porto), "--dem", str(DRONE.path), "-o", str(folder / "out"), "-q"]
-    assert main(["locate", str(DRONE.path), *given]) == 1
+    given = ["-r", str(porto), "--dem", str(DRONE), "-o", str(folder / "out"), "-q"]
+    assert main(["locate", str(DRONE), *given]) == 1
     assert "expected a terrain model" in capfd.readouterr().err

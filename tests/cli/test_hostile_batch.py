@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from worlds.pngs import png
+from worlds.rasters import write_raster
 
 from roadgeo.cli import main
 from roadgeo.evaluation.demo import demo_masks
@@ -22,11 +22,9 @@ def write_hostile(folder: Path) -> int:
     )
     source = '<VRTDataset rasterXSize="64" rasterYSize="64"><SRS>nonsense</SRS></VRTDataset>'
     (folder / "c_virtual.tif").write_text(source)
-    profile = {"driver": "GTiff", "width": 600, "height": 600, "count": 1, "crs": "EPSG:3857"}
-    with rasterio.open(folder / "d_complex.tif", "w", **profile, dtype="complex64") as sink:
-        sink.write(np.ones((1, 600, 600), np.complex64))
-    with rasterio.open(folder / "e_damaged.tif", "w", **profile, dtype="uint8", compress="deflate") as sink:
-        sink.write(np.random.default_rng(0).integers(0, 2, (1, 600, 600), np.uint8) * 255)
+    write_raster(folder / "d_complex.tif", np.ones((600, 600), np.complex64), crs="EPSG:3857")
+    values = np.random.default_rng(0).integers(0, 2, (600, 600), np.uint8) * 255
+    write_raster(folder / "e_damaged.tif", values, crs="EPSG:3857", compress="deflate")
     content = bytearray((folder / "e_damaged.tif").read_bytes())
     content[3000:9000] = bytes(6000)
     (folder / "e_damaged.tif").write_bytes(content)

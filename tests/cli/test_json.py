@@ -6,13 +6,12 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from worlds.demo import DRONE
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import PHOTO, demo_masks
+from roadgeo.evaluation.demo import PHOTO
 from roadgeo.location import Location, Reason
 from roadgeo.outputs.schemas import NAMES, read_schema
-
-DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(autouse=True)

@@ -7,12 +7,11 @@ import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
+from worlds.demo import DRONE, MASKS
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS
 from roadgeo.geometry.homography import Homography
-
-DRONE = next(mask for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +30,12 @@ def located(name: str, porto: Path, capfd: pytest.CaptureFixture[str], *more: st
 
 
 def test_lines_traced_on_a_picture_lie_where_the_picture_does(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["vectorize", str(DRONE.path)]) == 0
+    assert main(["vectorize", str(DRONE)]) == 0
     capfd.readouterr()
     found = located("drone_vectorized.gpkg", porto, capfd)
     to_crs = Homography(np.array(found["homography"])) @ Homography(np.array(found["query_to_pixel"]))
     pixels = np.array([[300.0, 200.0], [900.0, 700.0]])
-    truth = Homography(DRONE.homography)(pixels)
+    truth = Homography(MASKS["drone"].homography)(pixels)
     assert to_crs(pixels * (1, -1)) == pytest.approx(truth, abs=2.0)
     assert Path("drone_vectorized_footprint.tif").exists()
 

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from worlds.demo import DRONE
 from worlds.fenway import write_streets
 from worlds.pngs import chunk
+from worlds.rasters import write_raster
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import demo_masks
-
-DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
 def locate(mask: str, porto: Path, *more: str) -> int:
@@ -43,10 +42,8 @@ def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: Path) -
     if suffix == "png":
         cv2.imwrite("black.png", black)
     else:
-        profile = {"driver": "GTiff", "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES"}
-        profile |= {"height": black.shape[0], "width": black.shape[1], "transform": rasterio.Affine.scale(2)}
-        with rasterio.open("black.tif", "w", **profile) as dataset:
-            dataset.write(black.transpose(2, 0, 1))
+        of_alpha = {"photometric": "RGB", "alpha": "YES", "transform": rasterio.Affine.scale(2)}
+        write_raster("black.tif", black.transpose(2, 0, 1), **of_alpha)
     assert locate(f"black.{suffix}", porto) == 0
 
 
@@ -131,8 +128,6 @@ def test_the_place_that_a_mask_states_is_compared(porto: Path, capfd: pytest.Cap
     height, width = drone().shape
     x, y = found["center"]["x"] + 120.0, found["center"]["y"]
     place = rasterio.Affine(1, 0, x - width / 2, 0, -1, y + height / 2)
-    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": height, "width": width}
-    with rasterio.open("stated.tif", "w", **profile, crs=found["crs"], transform=place) as dataset:
-        dataset.write(drone(), 1)
+    write_raster("stated.tif", drone(), crs=found["crs"], transform=place)
     assert locate("stated.tif", porto) == 0
     assert "georeference puts the middle 120." in capfd.readouterr().out

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from worlds.demo import DRONE
 
 import roadgeo
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.kernels.compilation import compiled, kernel_folder
 from roadgeo.kernels.warmup import warm_up
 
@@ -40,8 +40,7 @@ def test_a_mask_is_located(porto: Path, tmp_path: Path) -> None:
     locked = [site, home, maps, *site.rglob("*"), *maps.iterdir()]
     for path in locked:
         path.chmod(0o555 if path.is_dir() else 0o444)
-    mask = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
-    command = ["locate", str(mask), "-r", str(maps / "porto.gpkg"), "-o", str(out), "--json", "--report"]
+    command = ["locate", str(DRONE), "-r", str(maps / "porto.gpkg"), "-o", str(out), "--json", "--report"]
     environment = {"PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(site), "TMPDIR": str(temporary)}
     try:
         done = subprocess.run(

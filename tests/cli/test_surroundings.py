@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from worlds.demo import DRONE
 
 from roadgeo.cli import main
 from roadgeo.errors import OutputError
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.storage.gdal import forget_missing_proj_data
 from roadgeo.storage.rasters import writing_raster
 from roadgeo.workflows import locate
-
-DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 
 def test_proj_data_that_are_not_where_the_environment_says_are_looked_for_elsewhere(

@@ -5,23 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.demo import MASKS
 
 import roadgeo
 from roadgeo.cli import main
 from roadgeo.errors import NotLocatedError
 from roadgeo.evaluation import scoring
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.evaluation.truth import Truth
 from roadgeo.outputs.wording import format_lonlat
 
-MASKS = {mask.path.stem: str(mask.path) for mask in demo_masks()}
-LOCATE = ["locate", MASKS["elsewhere"], "--effort", "quick"]
+PATHS = {name: str(mask.path) for name, mask in MASKS.items()}
+LOCATE = ["locate", PATHS["elsewhere"], "--effort", "quick"]
 
 
 @pytest.fixture(scope="module")
 def refused(porto: Path) -> roadgeo.Location:
     """The demonstration's mask of another city."""
-    return roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick")
+    return roadgeo.locate(PATHS["elsewhere"], str(porto), effort="quick")
 
 
 def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused):
@@ -41,7 +41,7 @@ def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused)
 
 
 def test_a_refusal_shows_the_places_by_their_numbers(porto, refused, capfd):
-    assert main(["locate", MASKS["elsewhere"], "-r", str(porto)]) == 3
+    assert main(["locate", PATHS["elsewhere"], "-r", str(porto)]) == 3
     (listed,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("  best places, 1: ")]
     second = refused.alternatives[1]
     assert f", 2: {format_lonlat(second.lon, second.lat)}, 3: " in listed
@@ -78,23 +78,23 @@ def test_a_place_that_is_not_listed_cannot_be_taken(porto, refused, capfd):
 
 
 def test_a_located_mask_stays_located(porto):
-    usual, taken = (roadgeo.locate(MASKS["drone"], str(porto), take=take) for take in (None, 1))
+    usual, taken = (roadgeo.locate(PATHS["drone"], str(porto), take=take) for take in (None, 1))
     assert (taken.status, taken.reason) == ("located", usual.reason)
     assert taken.center == usual.center
 
 
 def test_python_takes_a_place_too(porto, refused):
-    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=2)
+    taken = roadgeo.locate(PATHS["elsewhere"], str(porto), effort="quick", take=2)
     assert (taken.status, taken.located, taken.error_rate) == ("chosen", False, None)
     assert taken.to_xarray().shape
     with pytest.raises(NotLocatedError, match="there is no place 9"):
-        roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=9)
+        roadgeo.locate(PATHS["elsewhere"], str(porto), effort="quick", take=9)
     with pytest.raises(ValueError, match="take"):
-        roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=0)
+        roadgeo.locate(PATHS["elsewhere"], str(porto), effort="quick", take=0)
 
 
 def test_a_chosen_place_does_not_count_as_located(porto):
-    taken = roadgeo.locate(MASKS["elsewhere"], str(porto), effort="quick", take=1)
+    taken = roadgeo.locate(PATHS["elsewhere"], str(porto), effort="quick", take=1)
     truth = Truth("elsewhere.png", "no place", taken.homography, taken.crs, taken.size, on_map=False)
     assert not scoring.score(truth, taken.to_dict()).located
 

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 from support.read_all import BEGIN
+from worlds.demo import DRONE
 
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS
 from roadgeo.outputs.registry import ALSO
 from roadgeo.storage.folders import cache_dir
-
-DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 #: System calls that make, change or move a file.
 _CHANGES = (

@@ -9,16 +9,17 @@ import jsonschema
 import numpy as np
 import pytest
 import rasterio
+from worlds.demo import MASKS
+from worlds.rasters import write_raster
 from worlds.turned import mark_turned
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.schemas import read_schema
 from roadgeo.outputs.verification_files import write_fixed
 
-SHEET = next(mask for mask in demo_masks() if mask.path.stem == "map_sheet")
+SHEET = MASKS["map_sheet"]
 
 
 def georeferenced(name: str, east: float, north: float) -> Path:
@@ -29,10 +30,7 @@ def georeferenced(name: str, east: float, north: float) -> Path:
     x, y = Homography(SHEET.homography)(np.array([width / 2, height / 2]))
     corner = np.array([x + east, y + north]) - linear @ (width / 2, height / 2)
     place = rasterio.Affine(*linear[0], corner[0], *linear[1], corner[1])
-    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
-    with rasterio.open(name, "w", crs=SHEET.crs, transform=place, **profile) as file:
-        file.write(values, 1)
-    return Path(name)
+    return write_raster(name, values, crs=SHEET.crs, transform=place)
 
 
 def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(

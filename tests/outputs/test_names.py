@@ -7,13 +7,11 @@ from pathlib import Path
 import cv2
 import pytest
 import rasterio
+from worlds.demo import DRONE
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.outputs.names import bare_command, bare_name, bare_names, table_cell, without_folders
 from roadgeo.outputs.registry import ALSO
-
-DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 
 @pytest.mark.parametrize(

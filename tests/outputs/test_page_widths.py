@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from evaluation.test_report import answer, truth
-from outputs.test_report_pages import DEMO, render_report, rival
+from outputs.test_report_pages import render_report, rival
 from support.browser import Browser, browser
+from worlds.demo import MASKS
 
 from roadgeo.evaluation.report import render_report as render_evaluation
 from roadgeo.evaluation.scoring import evaluate
@@ -44,7 +45,7 @@ def pages(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
     """All pages by their states."""
     folder, reference = tmp_path_factory.mktemp("pages"), open_reference(porto)
     index = reference.index
-    drone, elsewhere = read_mask(DEMO["drone"].path), read_mask(DEMO["elsewhere"].path)
+    drone, elsewhere = read_mask(MASKS["drone"].path), read_mask(MASKS["elsewhere"].path)
     found = replace(locate(drone, reference), command=f"roadgeo locate {LONG}", reason=f"{LONG} agrees")
     refused = replace(locate(elsewhere, reference), query=LONG)
     photo = folder / "photo.jpg"
@@ -79,7 +80,7 @@ def pages(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         (folder / f"{state}.html").write_text(text, encoding="utf-8")
     for verdict, document in verified().items():
         place = Georeference(found.homography, found.crs, found.size, "geotransform") if verdict != "error" else None
-        picture = {**document, "image": str(DEMO["drone"].path) if place else LONG}
+        picture = {**document, "image": str(MASKS["drone"].path) if place else LONG}
         corrected = place if verdict == "off" else None
         write_verification(folder / f"verify {verdict}.html", picture, LONG, place, corrected, index)
     return {path.stem: path for path in folder.glob("*.html")}
@@ -96,7 +97,7 @@ def flight(index: object, found: Location) -> str:
     tracked[0].pose = tracked[0].reference = None
     pictures = Thumbnails()
     for row in rows:
-        pictures.add(row.number, read_mask(DEMO["drone"].path))
+        pictures.add(row.number, read_mask(MASKS["drone"].path))
     return render_flight(LONG, tracked, rows, pictures.kept)
 
 

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import rasterio
 from support.real_qgis import Qgis, is_running, make_program
+from worlds.demo import MASKS
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, ROADS
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis import installation
 
 PLUGIN = Path(installation.__file__).parent / "plugin"
-MASKS = {mask.path.stem: mask for mask in demo_masks()}
 ROAD, FOOTPRINT, MAP_ROAD = "#e4572e", "#1f6fb4", "#546e7a"
 
 

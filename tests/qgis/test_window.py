@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 from support.real_qgis import Qgis
+from worlds.demo import DRONE, MASKS
 
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS
 from roadgeo.qgis.plugin.refit import Match, fit, read_points
 
 FOOTPRINT, ROAD = "#1f6fb4", "#e4572e"
@@ -36,9 +37,8 @@ def seen(qgis: Qgis, folder: Path) -> dict:
         if os.environ.get("ROADGEO_REQUIRE_QGIS"):
             pytest.fail("ROADGEO_REQUIRE_QGIS is set, and xvfb-run or qgis is not installed")
         pytest.skip("QGIS's window needs qgis and xvfb-run (Debian: qgis xvfb xauth)")
-    masks = {mask.path.stem: str(mask.path) for mask in demo_masks()}
-    task = {"roads": str(ROADS), "picture": masks["drone"], "refused": masks["elsewhere"], "pictures": str(folder)}
-    answer = qgis.tour(**task, mended=str(qgis.folder / "mended"))
+    masks = {"picture": str(DRONE), "refused": str(MASKS["elsewhere"].path)}
+    answer = qgis.tour(roads=str(ROADS), pictures=str(folder), mended=str(qgis.folder / "mended"), **masks)
     assert "error" not in answer, answer["error"]
     return {**answer, "mended": str(qgis.folder / "mended")}
 

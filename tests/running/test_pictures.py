@@ -10,6 +10,7 @@ import rasterio
 import xarray
 from PIL import Image, ImageOps
 from rasterio.io import MemoryFile
+from worlds.rasters import write_raster
 from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
@@ -33,9 +34,7 @@ def test_a_dataset_that_is_no_file_is_read_with_its_nodata() -> None:
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_a_dataset_that_is_a_file_is_that_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    with rasterio.open(path, "w", driver="GTiff", dtype="uint8", count=1, height=40, width=50) as dataset:
-        dataset.write(GREY, 1)
+    path = write_raster(tmp_path / "a.tif", GREY)
     with rasterio.open(path) as dataset:
         assert read_picture(dataset) == str(path)
 

@@ -4,20 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds.demo import DRONE
 
-from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.reference.reference import open_reference
 from roadgeo.running.variants import in_pixels_of, mirrored, resampled
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 
-MASK = next(mask for mask in demo_masks() if mask.path.stem == "drone")
-
 
 @pytest.fixture(scope="module")
 def located(porto):
-    location = locate(read_mask(MASK.path), [open_reference(porto)])
+    location = locate(read_mask(DRONE), [open_reference(porto)])
     assert location.located
     return location
 
@@ -49,7 +47,7 @@ def test_what_has_no_place_has_none_on_another_grid(located):
 
 
 def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
-    variant = mirrored(read_mask(MASK.path))
+    variant = mirrored(read_mask(DRONE))
     turned = in_pixels_of(located, located.size, variant.matrix)
     assert np.allclose(turned.footprint, located.footprint[[1, 0, 3, 2]])
     assert np.allclose(turned.corner_sigma_m, located.corner_sigma_m[[1, 0, 3, 2]])
@@ -60,7 +58,7 @@ def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
 
 
 def test_masks_on_another_grid():
-    mask = read_mask(MASK.path)
+    mask = read_mask(DRONE)
     height, width = mask.shape
     seen = np.ones(mask.shape, np.bool_)
     seen[: height // 2] = False

@@ -7,10 +7,11 @@ import sys
 from pathlib import Path
 
 import cv2
+from worlds.demo import MASKS
 
-from roadgeo.evaluation.demo import PHOTO, demo_masks
+from roadgeo.evaluation.demo import PHOTO
 
-MASKS = [demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem in ("drone", "elsewhere", "map_sheet")]
+PATHS = [MASKS[name].path for name in ("drone", "elsewhere", "map_sheet")]
 #: The number of processors, for as many threads does the network take, and then a command.
 CODE = """
 import os, sys
@@ -41,14 +42,14 @@ def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int 
 
 
 def test_order_processes_and_threads_change_nothing(porto: Path, tmp_path: Path) -> None:
-    once = answers(porto, tmp_path / "a", MASKS)
+    once = answers(porto, tmp_path / "a", PATHS)
     assert {item["status"] for item in once.values()} == {"located", "not_located"}
-    assert answers(porto, tmp_path / "b", MASKS[::-1], "--jobs", "3", threads=4) == once
+    assert answers(porto, tmp_path / "b", PATHS[::-1], "--jobs", "3", threads=4) == once
 
 
 def test_threads_search_for_one_mask_as_one_does(porto: Path, tmp_path: Path) -> None:
     """With all that is tried for a mask that has no place."""
-    elsewhere = [mask for mask in MASKS if mask.stem == "elsewhere"]
+    elsewhere = [mask for mask in PATHS if mask.stem == "elsewhere"]
     once = answers(porto, tmp_path / "a", elsewhere, "--effort", "full")
     assert answers(porto, tmp_path / "b", elsewhere, "--effort", "full", "--jobs", "3") == once
 
