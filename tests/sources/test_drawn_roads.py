@@ -15,14 +15,6 @@ def mask(tmp_path_factory):
     return draw_roads(write_streets(tmp_path_factory.mktemp("lines") / "streets.gpkg")).mask.roads
 
 
-@pytest.mark.parametrize("name", ["a.osm", "a.osm.pbf", "a.parquet", "a.shp", "a.geojson", "a.fgb"])
-def test_files_of_every_format_are_drawn_alike(tmp_path, name, mask):
-    drawing = draw_roads(write_streets(tmp_path / name))
-    assert drawing.north_up
-    assert drawing.mask.roads.shape == mask.shape
-    assert (drawing.mask.roads != mask).mean() < 1e-3
-
-
 def test_a_layer_is_chosen(tmp_path, mask):
     file = tmp_path / "map.gpkg"
     write_vector(file, [shapely.LineString([(0, 0), (1, 1)])], layer="rivers")
@@ -50,8 +42,3 @@ def test_surfaces_are_filled_with_their_holes(tmp_path):
     assert area == pytest.approx(shapely.union(ring, street).area, rel=0.15)  # and the pixels that outlines touch
     column, row = np.round((drawing.to_pixel @ (300, -250, 1))[:2]).astype(int)
     assert not drawing.mask.roads[row, column]
-
-
-def test_points_are_none(tmp_path):
-    with pytest.raises(MaskError, match="holds Point, expected lines"):
-        draw_roads(write_vector(tmp_path / "a.gpkg", [shapely.Point(0, 0)]))

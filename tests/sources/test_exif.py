@@ -1,5 +1,7 @@
 import cv2
 import numpy as np
+import PIL.ExifTags
+import PIL.Image
 import pytest
 from click.testing import CliRunner
 
@@ -9,12 +11,10 @@ from roadgeo.sources.exif import read_focal_length
 
 
 def jpeg_with_exif(path, focal_mm):
-    """A JPEG with one EXIF tag, FocalLengthIn35mmFilm (0xA405), written byte by byte."""
-    picture = cv2.imencode(".jpg", np.zeros((60, 90, 3), np.uint8))[1].tobytes()
-    sub = b"\x01\x00" + b"\x05\xa4\x03\x00\x01\x00\x00\x00" + focal_mm.to_bytes(2, "little") + b"\x00\x00" + bytes(4)
-    ifd = b"\x01\x00" + b"\x69\x87\x04\x00\x01\x00\x00\x00" + (26).to_bytes(4, "little") + bytes(4)
-    exif = b"Exif\x00\x00" + b"II*\x00\x08\x00\x00\x00" + ifd + sub
-    path.write_bytes(picture[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + picture[2:])
+    """A JPEG with one EXIF tag, FocalLengthIn35mmFilm."""
+    exif = PIL.Image.Exif()
+    exif.get_ifd(PIL.ExifTags.IFD.Exif)[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = focal_mm
+    PIL.Image.new("RGB", (90, 60)).save(path, exif=exif)
     return path
 
 

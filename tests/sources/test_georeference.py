@@ -9,6 +9,7 @@ import pyproj
 import pytest
 import rasterio
 from rasterio.control import GroundControlPoint
+from worlds.rasters import write_raster
 from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
@@ -25,11 +26,12 @@ def at(place: rasterio.Affine, column: float, row: float) -> tuple[float, float]
     return a * column + b * row + c, d * column + e * row + f
 
 
+BLACK = np.zeros((60, 80), np.uint8)
+WORLD_FILE = "0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n"
+
+
 def write(path: Path, **given: object) -> Path:
-    profile = {"driver": "GTiff", "width": 80, "height": 60, "count": 1, "dtype": "uint8"}
-    with rasterio.open(path, "w", **profile, **given) as file:
-        file.write(np.zeros((60, 80), np.uint8), 1)
-    return path
+    return write_raster(path, BLACK, **given)
 
 
 def test_a_geotransform_is_read_and_taken_to_a_plane(tmp_path: Path) -> None:
@@ -64,9 +66,9 @@ def test_control_points_are_fitted(tmp_path: Path, count: int) -> None:
 
 def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
     path = tmp_path / "scan.png"
-    cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+    cv2.imwrite(str(path), BLACK)
     assert read_georeference(path) is None
-    (tmp_path / "scan.pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    (tmp_path / "scan.pgw").write_text(WORLD_FILE)
     with pytest.raises(CrsError, match="--crs"):
         read_georeference(path)
     found = read_georeference(path, "EPSG:32619")
@@ -80,8 +82,8 @@ def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("version", ["WKT1_ESRI", "WKT2_2019"])
 def test_a_prj_beside_a_world_file_names_its_crs(tmp_path: Path, version: str) -> None:
     path = tmp_path / "scan.png"
-    cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
-    path.with_suffix(".pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    cv2.imwrite(str(path), BLACK)
+    path.with_suffix(".pgw").write_text(WORLD_FILE)
     path.with_suffix(".prj").write_text(pyproj.CRS(32619).to_wkt(version))
     found = read_georeference(path)
     assert found is not None
@@ -97,7 +99,7 @@ def test_a_world_file_speaks_of_stored_pixels(tmp_path: Path, orientation: int) 
     path = save_turned(tmp_path / "scan.png", np.zeros((60, 80), np.uint8), orientation)
     with PIL.Image.open(path) as stored_picture:
         width, height = stored_picture.size
-    (tmp_path / "scan.pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    (tmp_path / "scan.pgw").write_text(WORLD_FILE)
     found = read_georeference(path, "EPSG:32619")
     assert found is not None
     assert found.size == (80, 60)
@@ -138,7 +140,7 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
         path = write(tmp_path / "a.tif", gcps=points, crs=crs.to_wkt())
     else:
         path = tmp_path / "a.png"
-        cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+        cv2.imwrite(str(path), BLACK)
         path.with_suffix(".wld").write_text(f"{step}\n0\n0\n{-step}\n{west + step / 2}\n{north - step / 2}\n")
         path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
     found = read_georeference(path)

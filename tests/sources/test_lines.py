@@ -125,29 +125,6 @@ def test_shapes_of_all_kinds():
     assert len(empty) == 0
 
 
-def test_measured_and_raised_lines_lose_the_rest(tmp_path):
-    write_vector(tmp_path / "z.gpkg", [LineString([(0, 0, 1), (1, 1, 2)])])
-    assert not shapely.has_z(read_lines(tmp_path / "z.gpkg").lines).any()
-
-
-@pytest.mark.parametrize(
-    ("kinds", "expected"),
-    [
-        ({"highway": ["residential", None, "service"], "name": ["a", "b", "c"]}, ["residential", "service"]),
-        ({"highway": ["residential", None, "service"]}, ["residential", None, "service"]),
-        ({"fclass": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
-        ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
-        ({"class": ["A", "B", "C"]}, None),
-        ({"name": ["residential", "b", "c"]}, None),
-        ({"class": ["A", "B", "C"], "fclass": ["trunk", "trunk", "trunk"]}, ["trunk"] * 3),
-    ],
-)
-def test_columns_that_say_the_kind(tmp_path, kinds, expected):
-    lines = [LineString([(k, 0), (k, 1)]) for k in range(3)]
-    read = read_lines(write_vector(tmp_path / "roads.gpkg", lines, **kinds))
-    assert (None if read.highway is None else read.highway.tolist()) == expected
-
-
 def test_a_file_without_crs_says_so(tmp_path):
     file = write_streets(tmp_path / "streets.shp")
     file.with_suffix(".prj").unlink()

@@ -112,15 +112,19 @@ def test_whom_to_name(columns, attribution):
         ),
         ({"tags": [{"highway": "residential"}, {"highway": "steps"}, {"barrier": "wall"}]}, ["residential", "steps"]),
         ({"class": [float("nan"), 3, True]}, None),
-        ({"fclass": [["residential", "tertiary"], "['primary', 'service']", "primary;steps"]}, None),
+        ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
+        ({"name": ["residential", "b", "c"]}, None),
+        ({"class": ["A", "B", "C"], "fclass": ["trunk", "trunk", "trunk"]}, ["trunk"] * 3),
+        (
+            {"fclass": [["residential", "tertiary"], "['primary', 'service']", "primary;steps"]},
+            ["residential;tertiary", "primary;service", "primary;steps"],
+        ),
     ],
 )
 def test_what_tells_the_kind(columns, kinds):
     shapes = column(*(shapely.LineString([(k, 0), (k, 1)]) for k in range(3)))
     made = RoadTable(shapes, None, {name: column(*values) for name, values in columns.items()})
     read = recognise(made).adapt(made)
-    if "fclass" in columns:
-        kinds = ["residential;tertiary", "primary;service", "primary;steps"]
     assert (None if read.highway is None else read.highway.tolist()) == kinds
     assert len(read.lines) == (len(kinds) if kinds is not None else 2 if "railway" in columns else 3)
 

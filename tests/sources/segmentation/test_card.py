@@ -57,9 +57,11 @@ def test_each_band_may_be_scaled_by_itself(tmp_path: Path) -> None:
     assert card.mean == pytest.approx((0.2, 0.4, 0.6))
 
 
-def test_the_tile_of_an_item(tmp_path: Path) -> None:
-    path = beside(brightness_model(tmp_path / "m.onnx", size=None), item(input={"shape": [-1, 3, 160, 160]}))
-    assert card_of(path).tile == (160, 160)
+def test_the_tile_and_the_pixel_of_an_item(tmp_path: Path) -> None:
+    described = item(input={"shape": [-1, 3, 160, 160]})
+    described["properties"] |= {"gsd": 0.3, "mlm:tasks": ["semantic-segmentation"]}
+    card = card_of(beside(brightness_model(tmp_path / "m.onnx", size=None), described))
+    assert (card.tile, card.resolution_m) == ((160, 160), 0.3)
 
 
 @pytest.mark.parametrize("document", [{}, [], {"properties": {"gsd": 0.3}}, {"properties": {"mlm:input": [{}]}}])

@@ -1,6 +1,5 @@
 """Models in the conventions of others run unchanged, or one line says what is wrong with them."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -88,33 +87,6 @@ def test_the_head_of_roads_is_chosen(tmp_path: Path, picture: np.ndarray) -> Non
     assert network.card.output == "road"
     sees(network, picture)
     assert load_network(path, class_name="buildings").card.output == "buildings"
-
-
-def test_a_stac_item_beside_the_model(tmp_path: Path, picture: np.ndarray) -> None:
-    path = brightness_model(tmp_path / "m.onnx", classes=2, road=1, last=None)
-    item = {
-        "type": "Feature",
-        "properties": {
-            "gsd": 0.3,
-            "mlm:tasks": ["semantic-segmentation"],
-            "mlm:input": [
-                {
-                    "input": {"shape": [1, 3, 64, 64], "dim_order": ["batch", "channel", "height", "width"]},
-                    "value_scaling": [{"type": "min-max", "minimum": 0, "maximum": 255}],
-                }
-            ],
-            "mlm:output": [
-                {"classification:classes": [{"value": 0, "name": "background"}, {"value": 1, "name": "roads"}]}
-            ],
-        },
-    }
-    path.with_suffix(".json").write_text(json.dumps(item))
-    network = load_network(path)
-    assert network.card.resolution_m == 0.3
-    assert network.card.mean == (0.0, 0.0, 0.0)
-    assert network.card.std == (1.0, 1.0, 1.0)
-    assert network.card.channels == (1,)
-    sees(network, picture)
 
 
 @pytest.mark.parametrize(

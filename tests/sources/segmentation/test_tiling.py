@@ -8,11 +8,11 @@ import PIL.Image
 import pytest
 import rasterio
 from worlds.models import brightness_model
+from worlds.rasters import write_raster
 from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import spread_probability
-from roadgeo.sources.bands import PROBABILITY_TAG
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
@@ -80,20 +80,14 @@ def test_tiles_are_no_larger_than_they_need_be(
 )
 def test_colours_are_taken_by_their_names(tmp_path: Path, names: tuple[str, ...], shown: tuple[int, ...]) -> None:
     bands = np.stack([np.full((70, 80), value, np.uint8) for value in (10, 60, 110, 160)])
-    path = tmp_path / "bands.tif"
-    with rasterio.open(path, "w", driver="GTiff", count=4, height=70, width=80, dtype="uint8") as dataset:
-        dataset.write(bands)
-        dataset.descriptions = names
-    with open_photograph(path) as photograph:
+    with open_photograph(write_raster(tmp_path / "bands.tif", bands, names=names)) as photograph:
         rgb, _ = photograph.read(0, 0, 80, 70, (70, 80))
     assert tuple(rgb[0, 0]) == tuple(bands[list(shown), 0, 0])
 
 
 def test_bands_are_taken_in_the_order_asked_for(tmp_path: Path) -> None:
     values = np.array([10, 60, 110, 160], np.uint8)
-    path = tmp_path / "bgrn.tif"
-    with rasterio.open(path, "w", driver="GTiff", count=4, height=70, width=80, dtype="uint8") as dataset:
-        dataset.write(np.tile(values[:, None, None], (1, 70, 80)))
+    path = write_raster(tmp_path / "bgrn.tif", np.tile(values[:, None, None], (1, 70, 80)))
     with open_photograph(path, (3, 2, 1)) as photograph:
         rgb, _ = photograph.read(0, 0, 80, 70, (70, 80))
     assert rgb[0, 0].tolist() == [110, 60, 10]
@@ -129,15 +123,9 @@ def test_voids_are_not_observed(tmp_path: Path, network, photo: Path) -> None:
     image = cv2.imread(str(photo))
     image[:, :60] = 255
     image[95:, 120:] = 0
-    path = tmp_path / "void.tif"
-    with rasterio.open(
-        path, "w", driver="GTiff", width=180, height=150, count=4, dtype="uint8", photometric="RGB", alpha="yes"
-    ) as dataset:
-        dataset.write(np.moveaxis(image[..., ::-1], 2, 0), [1, 2, 3])
-        alpha = np.full((150, 180), 255, np.uint8)
-        alpha[:30] = 0
-        dataset.write(alpha, 4)
-    with open_photograph(path) as opened:
+    rgba = np.concatenate([np.moveaxis(image[..., ::-1], 2, 0), np.full((1, 150, 180), 255, np.uint8)])
+    rgba[3, :30] = 0
+    with open_photograph(write_raster(tmp_path / "void.tif", rgba, photometric="RGB", alpha="yes")) as opened:
         found = segment(opened, network)
     observed = found.mask(0.5).observed
     assert observed is not None
@@ -165,39 +153,15 @@ def test_a_photograph_of_nothing_is_refused(tmp_path: Path, network) -> None:
 @pytest.mark.parametrize("kind", ["grey", "uint16", "palette", "float"])
 def test_other_values_are_made_rgb(tmp_path: Path, network, kind: str) -> None:
     ground = np.where(streets(), 220, 50)
-    path = tmp_path / "photo.tif"
-    values = {"uint16": (ground * 40).astype(np.uint16), "float": ground.astype(np.float32) / 7}.get(
-        kind, ground.astype(np.uint8)
-    )
-    with rasterio.open(path, "w", driver="GTiff", width=180, height=150, count=1, dtype=values.dtype) as dataset:
-        if kind == "palette":
-            dataset.write(streets().astype(np.uint8), 1)
-            dataset.write_colormap(1, {0: (50, 50, 50, 255), 1: (220, 220, 220, 255)})
-        else:
-            dataset.write(values, 1)
-    with open_photograph(path) as opened:
+    values = {
+        "grey": ground.astype(np.uint8),
+        "uint16": (ground * 40).astype(np.uint16),
+        "palette": streets().astype(np.uint8),
+        "float": ground.astype(np.float32) / 7,
+    }[kind]
+    colors = {0: (50, 50, 50, 255), 1: (220, 220, 220, 255)} if kind == "palette" else None
+    with open_photograph(write_raster(tmp_path / "photo.tif", values, colors=colors)) as opened:
         np.testing.assert_array_equal(segment(opened, network).mask(0.5).roads, streets())
-
-
-def test_the_same_on_every_run_and_with_any_number_of_threads(tmp_path: Path, photo: Path) -> None:
-    path = brightness_model(tmp_path / "m.onnx")
-    found = []
-    for threads in (1, 1, 2):
-        with open_photograph(photo) as opened:
-            found.append(segment(opened, load_network(path, threads=threads), 1.3).values)
-    np.testing.assert_array_equal(found[0], found[1])
-    np.testing.assert_array_equal(found[0], found[2])
-
-
-def test_a_map_is_kept_with_nodata(tmp_path: Path) -> None:
-    values = np.full((70, 80), 12, np.uint8)
-    values[:, :40] = NODATA
-    ProbabilityMap(values, 0.4, "photo.jpg", "m.onnx").write(tmp_path / "photo_mask.tif")
-    with rasterio.open(tmp_path / "photo_mask.tif") as dataset:
-        np.testing.assert_array_equal(dataset.read(1), values)
-        assert dataset.nodata == NODATA
-        assert PROBABILITY_TAG in dataset.tags()
-        assert dataset.tags()["THRESHOLD"] == "0.4"
 
 
 @pytest.mark.parametrize("void", [False, True])
