@@ -1,4 +1,3 @@
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import pytest
 import rasterio
 from outputs.test_location_files import located
 from rasterio.enums import ColorInterp
+from worlds.rasters import write_raster
 from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
@@ -28,19 +28,16 @@ PLACE = Placement.of(located())
 MASK_SIZE = (400, 300)
 
 
-def write(path: Path, bands: np.ndarray, **profile: object) -> Path:
-    """Write (bands, rows, columns)."""
-    count, height, width = bands.shape
-    size = {"width": width, "height": height, "count": count, "dtype": bands.dtype.name}
-    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", driver="GTiff", **size, **profile) as sink:
-        sink.write(bands)
-    return path
-
-
 def positions(height: int, width: int, dtype: str = "uint16") -> np.ndarray:
     """Two bands: 100 + 10 times the column and the row of each pixel's centre; linear, so interpolation keeps them."""
     rows, columns = np.indices((height, width)) + 0.5
     return (100 + 10 * np.stack([columns, rows])).astype(dtype)
+
+
+def places(raster: rasterio.DatasetReader) -> np.ndarray:
+    """(2, rows, columns): x and y of the middles of pixels."""
+    rows, columns = np.indices(raster.shape) + 0.5
+    return np.stack([raster.transform.c + raster.transform.a * columns, raster.transform.f + raster.transform.e * rows])
 
 
 @pytest.mark.parametrize(
@@ -59,15 +56,14 @@ def test_every_pixel_shows_the_ground_where_it_lies(
     tmp_path: Path, crs: str | None, scale: int, resampling: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(orthophoto, "_BLOCK", 150)
-    source = write(tmp_path / "a.tif", positions(300 * scale, 400 * scale))
+    source = write_raster(tmp_path / "a.tif", positions(300 * scale, 400 * scale))
     homography, size = image_homography(PLACE, MASK_SIZE, source)
     assert size == (400 * scale, 300 * scale)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(crs=crs, resampling=resampling))
     with rasterio.open(tmp_path / "b.tif") as raster:
         column, row, alpha = raster.read().astype(float)
         assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-        rows, columns = np.indices(alpha.shape) + 0.5
-        x, y = raster.transform.c + raster.transform.a * columns, raster.transform.f + raster.transform.e * rows
+        x, y = places(raster)
         if crs:
             assert raster.crs == rasterio.CRS.from_user_input(crs)
             x, y = pyproj.Transformer.from_crs(crs, PLACE.crs, always_xy=True).transform(x, y)
@@ -118,7 +114,7 @@ def test_a_mask_of_the_stored_pixels_is_told_so(tmp_path: Path) -> None:
 def test_bands_and_depth_are_kept(tmp_path: Path, bands: int, dtype: str, colors: list[ColorInterp]) -> None:
     photometric = {"photometric": "RGB"} if bands == 3 else {}
     levels = np.arange(200, 200 + bands, dtype=dtype)
-    source = write(tmp_path / "a.tif", np.tile(levels[:, None, None], (1, 30, 40)), **photometric)
+    source = write_raster(tmp_path / "a.tif", np.tile(levels[:, None, None], (1, 30, 40)), **photometric)
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {"ROADGEO_QUERY": "a"})
     with rasterio.open(tmp_path / "b.tif") as raster:
@@ -134,7 +130,7 @@ def test_bands_and_depth_are_kept(tmp_path: Path, bands: int, dtype: str, colors
 def test_alpha_of_the_picture_is_kept(tmp_path: Path) -> None:
     bands = np.full((4, 300, 400), 200, "uint8")
     bands[:, :, 200:] = 0
-    source = write(tmp_path / "a.tif", bands, photometric="RGB", alpha="yes")
+    source = write_raster(tmp_path / "a.tif", bands, photometric="RGB", alpha="yes")
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
     with rasterio.open(tmp_path / "b.tif") as raster:
@@ -149,7 +145,7 @@ def test_other_types_have_a_nodata_value(tmp_path: Path, dtype: str, nodata: flo
     values = np.full((1, 300, 400), 50, dtype)
     if nodata is not None:
         values[:, :, 200:] = nodata
-    source = write(tmp_path / "a.tif", values, nodata=nodata)
+    source = write_raster(tmp_path / "a.tif", values, nodata=nodata)
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
     with rasterio.open(tmp_path / "b.tif") as raster:
@@ -165,14 +161,13 @@ def test_a_large_picture_in_rows_is_tiled_first_and_read_coarser(
 ) -> None:
     monkeypatch.setattr(orthophoto, "_TILED_BYTES", 1000)
     monkeypatch.setattr(orthophoto, "_MAX_SOURCE", 100)
-    source = write(tmp_path / "a.tif", positions(300, 400))
+    source = write_raster(tmp_path / "a.tif", positions(300, 400))
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     grid = warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(max_pixels=2000))
     assert grid.width * grid.height < 2300
     with rasterio.open(tmp_path / "b.tif") as raster:
-        column, row, alpha = raster.read().astype(float)
-        rows, columns = np.indices(alpha.shape) + 0.5
-        x, y = raster.transform.c + raster.transform.a * columns, raster.transform.f + raster.transform.e * rows
+        column, row, _ = raster.read().astype(float)
+        x, y = places(raster)
     expected = Homography(homography).inverse()(np.stack([x, y], axis=-1))
     inner = (expected > 12).all(axis=-1) & (expected < (388, 288)).all(axis=-1)
     assert np.abs(np.stack([column, row], axis=-1)[inner] / 10 - 10 - expected[inner]).max() < 4
@@ -183,7 +178,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("no picture")
     with pytest.raises(MaskError, match="not a raster"):
         image_homography(PLACE, MASK_SIZE, tmp_path / "a.txt")
-    source = write(tmp_path / "a.tif", np.zeros((1, 300, 300), "uint8"))
+    source = write_raster(tmp_path / "a.tif", np.zeros((1, 300, 300), "uint8"))
     with pytest.raises(MaskError, match="300 x 300 pixels, its mask 400 x 300"):
         image_homography(PLACE, MASK_SIZE, source)
     with pytest.raises(CrsError, match="banana"):
@@ -204,7 +199,7 @@ def test_a_preview_is_small_and_shows_what_is_known(tmp_path: Path, dtype: str, 
         alpha = np.where(np.arange(600) < 500, np.iinfo(dtype).max, 0).astype(dtype)
         bands = np.concatenate([bands, np.tile(alpha, (400, 1))[None]])
         profile = {"photometric": "RGB", "alpha": "yes"}
-    preview = read_preview(write(tmp_path / "a.tif", bands, **profile), 300)
+    preview = read_preview(write_raster(tmp_path / "a.tif", bands, **profile), 300)
     assert preview.shape == (200, 300, 4)
     assert preview.dtype == np.uint8
     assert (preview[:, :248, 3] == 255).all()
@@ -217,10 +212,8 @@ def test_a_preview_is_small_and_shows_what_is_known(tmp_path: Path, dtype: str, 
 
 def test_a_preview_of_a_palette_shows_its_colours(tmp_path: Path) -> None:
     labels = np.repeat(np.array([[0, 1]], np.uint8), 40, axis=0).repeat(20, axis=1)[None]
-    path = write(tmp_path / "a.tif", labels, photometric="palette")
-    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "r+") as sink:
-        sink.write_colormap(1, {0: (10, 20, 30, 255), 1: (200, 100, 50, 255)})
-    preview = read_preview(path, 1000)
+    colors = {0: (10, 20, 30, 255), 1: (200, 100, 50, 255)}
+    preview = read_preview(write_raster(tmp_path / "a.tif", labels, colors=colors, photometric="palette"), 1000)
     assert preview[5, 5].tolist() == [10, 20, 30, 255]
     assert preview[5, 35].tolist() == [200, 100, 50, 255]
 
@@ -234,7 +227,7 @@ def blobs(height: int, width: int) -> np.ndarray:
 
 @pytest.mark.parametrize("compression", ["deflate", "zstd", "jpeg", "webp"])
 def test_a_result_is_compressed_as_asked_for(tmp_path: Path, compression: CompressionName) -> None:
-    source = write(tmp_path / "a.tif", blobs(300, 400), photometric="RGB")
+    source = write_raster(tmp_path / "a.tif", blobs(300, 400), photometric="RGB")
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     drawn = []
     for name in ("deflate", compression):
@@ -252,7 +245,7 @@ def test_a_result_is_compressed_as_asked_for(tmp_path: Path, compression: Compre
 def test_a_compression_that_cannot_hold_a_picture_is_refused(
     tmp_path: Path, compression: CompressionName, bands: int
 ) -> None:
-    source = write(tmp_path / "a.tif", np.full((bands, 300, 400), 7, "uint8"))
+    source = write_raster(tmp_path / "a.tif", np.full((bands, 300, 400), 7, "uint8"))
     with pytest.raises(MaskError, match=rf"{compression} holds .*; the picture has {bands} of uint8: choose deflate"):
         warp_image(source, tmp_path / "b.tif", PLACE, PLACE.homography, {}, ImageOptions(compression=compression))
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
@@ -260,7 +253,7 @@ def test_a_compression_that_cannot_hold_a_picture_is_refused(
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_overviews_show_the_same_ground_and_no_dark_edge(tmp_path: Path, dtype: str) -> None:
-    source = write(tmp_path / "a.tif", np.full((1, 900, 1200), 200, dtype))
+    source = write_raster(tmp_path / "a.tif", np.full((1, 900, 1200), 200, dtype))
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
     with rasterio.open(tmp_path / "b.tif") as raster:

@@ -1,6 +1,5 @@
 import csv
 import json
-import shutil
 import xml.etree.ElementTree as ET
 import zipfile
 from dataclasses import replace
@@ -43,28 +42,6 @@ def photo_homography() -> Homography:
     return Homography(located().homography @ np.diag([0.5, 0.5, 1.0]))
 
 
-@pytest.mark.parametrize("name", ["mask_gcps.tif", "mask_gcps.vrt"])
-def test_control_points_lie_where_the_homography_says(written: OutputPaths, name: str) -> None:
-    with open_raster(written.folder / name, is_ours=True) as raster:
-        points, crs = raster.gcps
-        assert crs.to_epsg() == 32629
-        assert (raster.width, raster.height, raster.count) == (800, 600, 3)
-        pixels = raster.read()
-    assert len(points) == 25
-    expected = photo_homography()(np.array([[point.col, point.row] for point in points]))
-    np.testing.assert_allclose([[point.x, point.y] for point in points], expected, atol=1e-6)
-    photo = cv2.imread(str(written.folder.parent / "photo.png"))[..., ::-1]
-    np.testing.assert_array_equal(pixels.transpose(1, 2, 0), photo)
-
-
-def test_points_for_the_qgis_georeferencer(written: OutputPaths) -> None:
-    first, header, *rows = (written.folder / "photo.png.points").read_text().splitlines()
-    assert pyproj.CRS.from_user_input(first.removeprefix("#CRS: ")).to_epsg() == 32629
-    assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
-    x, y, column, row = np.array([line.split(",")[:4] for line in rows], float).T
-    np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, -row], 1)), atol=1e-6)
-
-
 def test_the_matches_are_told_with_their_residuals(written: OutputPaths) -> None:
     with (written.folder / "mask_matches.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -77,8 +54,7 @@ def test_the_matches_are_told_with_their_residuals(written: OutputPaths) -> None
     offset = np.array([(row["dx_m"], row["dy_m"]) for row in rows], float)
     np.testing.assert_allclose(photo_homography()(pixels) + offset, on_map, atol=1e-6)
     np.testing.assert_allclose([float(row["residual_m"]) for row in rows], evidence.residual_m, atol=1e-6)
-    _, header, *lines = (written.folder / "photo.png_matches.points").read_text().splitlines()
-    assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
+    _, _, *lines = (written.folder / "photo.png_matches.points").read_text().splitlines()
     points = np.array([line.split(",") for line in lines], float)
     np.testing.assert_allclose(points[:, :2], on_map)
     np.testing.assert_allclose(points[:, 2:4], pixels * (1, -1))
@@ -86,17 +62,9 @@ def test_the_matches_are_told_with_their_residuals(written: OutputPaths) -> None
     np.testing.assert_allclose(photo_homography()(fitted * (1, -1)), on_map, atol=1e-6)
 
 
-def test_control_points_for_opendronemap(written: OutputPaths) -> None:
-    first, *rows = (written.folder / "mask_gcp_list.txt").read_text().splitlines()
-    assert first == "EPSG:32629"
-    assert {row.split()[5] for row in rows} == {"photo.png"}
-    x, y, z, column, row = np.array([line.split()[:5] for line in rows], float).T
-    assert (z == 0).all()
-    np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, row], 1)), atol=1e-6)
-
-
 #: From (column, row) of the pixels of a file of (width, height) to those of the upright picture.
 UPRIGHT = {
+    1: lambda pixel, size: pixel,
     3: lambda pixel, size: size - pixel,
     5: lambda pixel, size: pixel[:, ::-1],
     6: lambda pixel, size: np.stack([size[1] - pixel[:, 1], pixel[:, 0]], 1),
@@ -104,7 +72,8 @@ UPRIGHT = {
 
 
 @pytest.mark.parametrize("orientation", UPRIGHT)
-def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_path: Path, orientation: int) -> None:
+def test_programs_get_points_of_the_stored_pixels(tmp_path: Path, orientation: int) -> None:
+    """They do not turn pictures."""
     picture = np.random.default_rng(1).integers(0, 255, (600, 800, 3)).astype(np.uint8)
     photo = save_turned(tmp_path / "photo.png", picture, orientation)
     stored = cv2.imread(str(photo), cv2.IMREAD_UNCHANGED)[..., ::-1]
@@ -119,13 +88,20 @@ def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_
 
     for name in ("mask_gcps.tif", "mask_gcps.vrt"):
         with open_raster(tmp_path / name, is_ours=True) as raster:
-            points, _ = raster.gcps
+            points, crs = raster.gcps
+            assert (len(points), crs.to_epsg()) == (25, 32629)
             np.testing.assert_array_equal(np.moveaxis(raster.read(), 0, 2), stored)
         right(np.array([(p.col, p.row) for p in points]), np.array([(p.x, p.y) for p in points]))
-    rows = np.array([line.split()[:5] for line in (tmp_path / "mask_gcp_list.txt").read_text().splitlines()[1:]], float)
+    first, *lines = (tmp_path / "mask_gcp_list.txt").read_text().splitlines()
+    assert (first, {line.split()[5] for line in lines}) == ("EPSG:32629", {"photo.png"})
+    rows = np.array([line.split()[:5] for line in lines], float)
     right(rows[:, 3:5], rows[:, :2])
+    assert (rows[:, 2] == 0).all()
     for name in ("photo.png.points", "photo.png_matches.points"):
-        rows = np.array([line.split(",") for line in (tmp_path / name).read_text().splitlines()[2:]], float)
+        first, header, *lines = (tmp_path / name).read_text().splitlines()
+        assert pyproj.CRS.from_user_input(first.removeprefix("#CRS: ")).to_epsg() == 32629
+        assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
+        rows = np.array([line.split(",") for line in lines], float)
         fitted = rows[:, 2:4] + rows[:, 5:7]
         right(fitted * (1, -1), rows[:, :2])
     with (tmp_path / "mask_matches.csv").open(encoding="utf-8") as file:
@@ -240,10 +216,3 @@ def test_a_footprint_astride_180_degrees_is_cut_there(tmp_path: Path) -> None:
     assert 180 < east < 180.1  # as KML wants it
     assert picture[..., 3].max() == 255
     assert max(picture.shape[:2]) < 1000
-
-
-def test_a_mask_that_was_not_located_loses_its_products(written: OutputPaths, tmp_path: Path) -> None:
-    shutil.copytree(written.folder, tmp_path / "out")
-    paths = output_paths(tmp_path / "out", "mask")
-    write_location(replace(located(), status="not_located"), road_mask(), paths, None, "photo.png")
-    assert [path.name for path in paths.folder.iterdir()] == ["mask_location.json"]

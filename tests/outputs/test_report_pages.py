@@ -13,44 +13,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from support.browser import Browser, Page, browser
+from worlds.demo import MASKS
 
 from roadgeo.cli import main
 from roadgeo.errors import MaskError, OutputError
-from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.location import Evidence, Location, Place, Reason
-from roadgeo.matching.index import ReferenceIndex, build_index
+from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.report import Entry, render_batch, write_batch
 from roadgeo.outputs.report.page import render_report as render_subject
 from roadgeo.outputs.subject import Subject, ViewOptions
-from roadgeo.reference.reference import Reference
-from roadgeo.roads.network import build_network
+from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.sources.masks import read_mask
-from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import locate
 
 __all__ = ["browser"]
 
 MAX_BYTES = 3_000_000
-DEMO = {mask.path.stem: mask for mask in demo_masks()}
 
 
 @pytest.fixture(scope="module")
-def porto() -> Reference:
+def porto(porto: Path) -> Reference:
     """The map of the demonstration."""
-    roads = read_roads(ROADS, attribution=ATTRIBUTION)
-    network = build_network(roads.lines, roads.plane, {"name": "porto", **roads.meta})
-    return Reference(build_index(network), network)
+    return open_reference(porto)
 
 
 @pytest.fixture(scope="module")
 def drone() -> RoadMask:
     """A mask that shows a part of it from a tilted camera."""
-    return replace(read_mask(DEMO["drone"].path), name="drone.png")
+    return replace(read_mask(MASKS["drone"].path), name="drone.png")
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +136,7 @@ def test_the_page_asks_nobody_for_anything(porto: Reference, drone: RoadMask, fo
 
 
 def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) -> None:
-    mask = read_mask(DEMO["elsewhere"].path)
+    mask = read_mask(MASKS["elsewhere"].path)
     location = locate(mask, porto)
     text = Reader(page := render_report(location, mask, porto.index)).text
     assert location.status == "not_located"
@@ -273,7 +269,7 @@ def test_the_command_line_writes_reports(
     monkeypatch.chdir(tmp_path)
     porto.save("porto.gpkg")
     for name in ("drone", "elsewhere"):
-        (tmp_path / f"{name}.png").write_bytes(DEMO[name].path.read_bytes())
+        (tmp_path / f"{name}.png").write_bytes(MASKS[name].path.read_bytes())
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "broken_report.html").touch()  # of an earlier run, when it was not broken
     arguments = ["locate", "drone.png", "elsewhere.png", "broken.png", "-r", "porto.gpkg", "--report", "--jobs", "2"]
@@ -529,7 +525,7 @@ def test_both_views_show_the_ground_under_the_pointer(browser: Browser, report: 
 
 
 def test_a_mask_without_a_place_opens_too(browser: Browser, porto: Reference, tmp_path: Path) -> None:
-    mask = read_mask(DEMO["elsewhere"].path)
+    mask = read_mask(MASKS["elsewhere"].path)
     path = tmp_path / "elsewhere_report.html"
     path.write_text(render_report(locate(mask, porto), mask, porto.index, ATTRIBUTION), encoding="utf-8")
     with browser.open(path, 390, 844, phone=True) as page:
