@@ -95,10 +95,16 @@ def test_an_index_alone_serves(path: Path, network: RoadNetwork) -> None:
     assert open_reference(path, never)[0] == parts(network)[0]
 
 
+def set_version(index: Path, version: int) -> bytes:
+    """Give an index another format version; return what it was."""
+    raw = index.read_bytes()
+    index.write_bytes(raw[:16] + struct.pack("<I", version) + raw[20:])
+    return raw
+
+
 def test_an_index_of_an_earlier_format_is_built_again(path: Path, network: RoadNetwork) -> None:
     index = path.with_suffix(".index")
-    raw = index.read_bytes()
-    index.write_bytes(raw[:16] + struct.pack("<I", 0) + raw[20:])
+    raw = set_version(index, 0)
     assert reference_freshness(path) == "old format"
     assert describe_reference(path)["counts"]["intersections"] == len(network.intersections)
     with pytest.raises(IndexFormatError, match="format version 0"):
@@ -110,8 +116,7 @@ def test_an_index_of_an_earlier_format_is_built_again(path: Path, network: RoadN
 
 def test_an_index_of_a_later_format_is_refused(path: Path) -> None:
     index = path.with_suffix(".index")
-    raw = index.read_bytes()
-    index.write_bytes(raw[:16] + struct.pack("<I", 99) + raw[20:])
+    set_version(index, 99)
     with pytest.raises(
         IndexFormatError,
         match=rf"format version 99.*reads version {FORMAT_VERSION}; use a later .*--rebuild \S*grid\.gpkg$",
@@ -121,9 +126,7 @@ def test_an_index_of_a_later_format_is_refused(path: Path) -> None:
 
 
 def test_an_old_index_alone_says_what_is_missing(path: Path) -> None:
-    index = path.with_suffix(".index")
-    raw = index.read_bytes()
-    index.write_bytes(raw[:16] + struct.pack("<I", 0) + raw[20:])
+    set_version(path.with_suffix(".index"), 0)
     path.unlink()
     with pytest.raises(IndexFormatError, match=r"format version 0.*put grid\.gpkg beside it"):
         open_reference(path, parts)

@@ -180,17 +180,6 @@ def test_too_little_memory_is_no_fault_of_the_file(
     assert isinstance(raised.value, IndexFormatError) == is_the_file
 
 
-def test_other_versions_are_named(path: Path) -> None:
-    raw = bytearray(path.read_bytes())
-    raw[16:20] = struct.pack("<I", 7)
-    path.write_bytes(raw)
-    with pytest.raises(
-        IndexFormatError,
-        match=rf"format version 7.*reads version {FORMAT_VERSION}; use a later .*make both again with `roadgeo index`",
-    ):
-        read_index(path)
-
-
 # --- damage -----------------------------------------------------------------------------------------------------------
 
 
@@ -228,19 +217,6 @@ def test_every_truncation_and_extension_is_refused(path: Path) -> None:
         assert refused_or_equal(path), size
     path.write_bytes(raw + b"\0")
     assert refused_or_equal(path)
-
-
-@pytest.mark.slow
-@given(data=st.data())
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_moved_ranges_are_refused_or_harmless(path: Path, data: st.DataObject) -> None:
-    write_index(path, META, ARRAYS, {"name": "Böston", "n": 150})
-    raw = bytearray(path.read_bytes())
-    size = data.draw(st.integers(1, 5000))
-    source, target = (data.draw(st.integers(0, len(raw) - size)) for _ in range(2))
-    raw[source : source + size], raw[target : target + size] = raw[target : target + size], raw[source : source + size]
-    path.write_bytes(raw)
-    refused_or_equal(path)
 
 
 def test_checksum_sees_swapped_words_rows_and_pages() -> None:
