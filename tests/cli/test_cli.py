@@ -1,13 +1,16 @@
-import os
 import subprocess
 import sys
 
 import click
 import pytest
+from cli.test_progress import Terminal
 
 from roadgeo.cli import COMMANDS, LazyGroup, cli, main
-from roadgeo.cli.options import BOX, NEAR, RANGE, Read
+from roadgeo.cli.options import ASPECT, BOX, NEAR, RANGE, Read
 from roadgeo.errors import RoadgeoError
+from roadgeo.matching.hints import HINTS
+
+FOCAL = Read("focal", HINTS["focal"].read)
 
 
 def test_help_imports_click_and_nothing_heavy() -> None:
@@ -33,18 +36,6 @@ def test_no_command_shows_help(group: tuple[str, ...], capfd: pytest.CaptureFixt
     assert out.startswith(" ".join(("Usage: roadgeo", *group)))
     assert "\nCommands:\n" in out
     assert err == ""
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nonesuch"], "Error: No such command 'nonesuch'. Try 'roadgeo --help'.\n"),
-        (["reference", "info"], "Error: Missing argument 'REF'. Try 'roadgeo reference info --help'.\n"),
-    ],
-)
-def test_usage_is_one_line_and_status_2(arguments: list[str], message: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
-    assert capfd.readouterr() == ("", message)
 
 
 @pytest.mark.parametrize(
@@ -94,9 +85,14 @@ def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
         (RANGE, "2", (2.0, 2.0)),
         (NEAR, "-71.1,42.3,5000", (-71.1, 42.3, 5000.0)),
         (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
+        (FOCAL, "EXIF", "exif"),
+        (FOCAL, "1200", 1200.0),
+        (ASPECT, "unknown", "unknown"),
+        (ASPECT, "0.25", 0.25),
+        (ASPECT, "4", 4.0),
     ],
 )
-def test_numbers_are_read(kind: Read, text: str, numbers: tuple[float, ...]) -> None:
+def test_numbers_are_read(kind: Read, text: str, numbers: object) -> None:
     assert kind.convert(text, None, None) == numbers
     assert kind.convert(numbers, None, None) == numbers
 
@@ -114,6 +110,7 @@ def test_numbers_are_read(kind: Read, text: str, numbers: tuple[float, ...]) -> 
         (BOX, "1,2,3,2"),
         (BOX, "1,2,1,4"),
         (BOX, "1,2,190,4"),
+        *((ASPECT, text) for text in ("0.2", "4.1", "nan", "wide", "")),
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(kind: Read, text: str) -> None:
@@ -132,35 +129,28 @@ def test_the_shell_completes_commands(monkeypatch: pytest.MonkeyPatch, capfd: py
     assert capfd.readouterr().out == "plain,--gcps\n"
 
 
-def run_on_a_terminal(arguments: list[str], environment: dict[str, str]) -> str:
-    """Run the command line with a pseudo-terminal as standard output and error."""
-    pty = pytest.importorskip("pty")
-    leader, follower = pty.openpty()
-    command = [sys.executable, "-m", "roadgeo", *arguments]
-    with subprocess.Popen(command, stdout=follower, stderr=follower, env={**os.environ, **environment}) as process:
-        os.close(follower)
-        text = b""
-        try:
-            while part := os.read(leader, 4096):
-                text += part
-        except OSError:  # the other end is closed
-            pass
-        process.wait()
-    os.close(leader)
-    return text.decode()
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_colours_appear_on_terminals_that_want_them(no_color: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", no_color)
+    terminal = Terminal(sys.executable, "-m", "roadgeo", "reference", "info", "nonesuch")
+    assert terminal.end() == 1
+    error = "Error:" if no_color else "\x1b[31mError:\x1b[0m"
+    assert terminal.text.startswith(f"{error} no reference 'nonesuch'")
+    assert not no_color or "\x1b" not in terminal.text
 
 
-def test_colours_appear_on_terminals_that_want_them() -> None:
-    assert "\x1b[31mError:" in run_on_a_terminal(["reference", "info", "nonesuch"], {"NO_COLOR": ""})
-    plain = run_on_a_terminal(["reference", "info", "nonesuch"], {"NO_COLOR": "1"})
-    assert plain.startswith("Error: no reference 'nonesuch'")
-    assert "\x1b" not in plain
-
-
-@pytest.mark.parametrize(("typed", "meant"), [("locat", "locate"), ("vectorise", "vectorize"), ("indx", "index")])
-def test_a_mistyped_command_is_asked_about(typed: str, meant: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main([typed, "a.png"]) == 2
-    assert capfd.readouterr().err == f"Error: No such command '{typed}'. Did you mean {meant}? Try 'roadgeo --help'.\n"
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("locat a.png", "No such command 'locat'. Did you mean locate? Try 'roadgeo --help'.\n"),
+        ("vectorise a.png", "No such command 'vectorise'. Did you mean vectorize? Try 'roadgeo --help'.\n"),
+        ("nonesuch", "No such command 'nonesuch'. Try 'roadgeo --help'.\n"),
+        ("reference info", "Missing argument 'REF'. Try 'roadgeo reference info --help'.\n"),
+    ],
+)
+def test_a_mistyped_command_is_asked_about(typed: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(typed.split()) == 2
+    assert capfd.readouterr() == ("", f"Error: {message}")
 
 
 @pytest.mark.parametrize(

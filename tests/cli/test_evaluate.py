@@ -147,12 +147,6 @@ def test_what_is_wrong_is_said(town, arguments, status, words, capsys, monkeypat
     assert words in capsys.readouterr().err
 
 
-def test_an_unknown_table_is_refused(town, tmp_path, capsys):
-    (tmp_path / "truth.csv").write_text("a,b\n1,2\n")
-    assert run("evaluate", town, "--queries", tmp_path / "truth.csv") == 1
-    assert "no table of truths" in capsys.readouterr().err
-
-
 def test_masks_of_another_place_are_told(town, tmp_path, capsys):
     matrix = "1,0,9e5,0,-1,9e6,0,0,1"
     names = "file,crs,width,height," + ",".join(f"h{i}{j}" for i in range(3) for j in range(3))

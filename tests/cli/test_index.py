@@ -55,16 +55,6 @@ def test_answers_of_no_use_are_an_error_on_one_line(osm, tmp_path, capsys, answe
     assert not list(tmp_path.rglob("*.gpkg"))
 
 
-def test_files_become_a_reference(tmp_path, capsys):
-    folder = tmp_path / "maps"
-    folder.mkdir()
-    write_streets(folder / "a.osm.pbf")
-    write_streets(folder / "b.shp")
-    assert index("--roads", folder, "--out", tmp_path / "fenway.gpkg") == 0
-    assert "reading a.osm.pbf" in capsys.readouterr().err
-    assert (tmp_path / "fenway.index").exists()
-
-
 def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
     lines = [shapely.LineString(np.array(line.coords)) for line in random_lines(8, 30_000.0, 1200.0)]
     streets = [shapely.LineString(np.array(line.coords)) for line in random_lines(5, 3000.0)]
@@ -126,30 +116,6 @@ def test_a_folder_one_may_not_write_to_is_named_before_the_long_part(tmp_path, m
     output = capsys.readouterr().err
     assert output.endswith("permission denied; choose a folder you may write to\n")
     assert output.count("\n") == 1
-
-
-def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    streets = write_streets(tmp_path / "a.geojson")
-    out = tmp_path / "out"
-    monkeypatch.setattr("roadgeo.storage.files.sync_file", interrupt)  # both files are written, but not in place
-    assert index("--roads", streets, "--out", out / "a.gpkg", quiet=True) == 130
-    assert capsys.readouterr().err.strip() == "Interrupted."
-    assert not list(out.iterdir())
-
-
-def test_the_library_from_filling_to_removing(tmp_path, capsys):
-    streets = write_streets(tmp_path / "Fenway Streets.geojson")
-    for name in ("one", "two"):
-        assert index("--roads", streets, "--name", name, quiet=True) == 0
-    assert index("--roads", streets, quiet=True) == 0
-    assert main(["list"]) == 0
-    output = capsys.readouterr().out
-    assert [line.split()[0] for line in output.splitlines()] == ["fenway-streets", "one", "two"]
-    assert main(["remove", "one", "fenway-streets", "--yes"]) == 0
-    assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]
 
 
 def test_a_reference_is_a_geopackage(tmp_path, capsys):

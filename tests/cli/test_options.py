@@ -29,22 +29,6 @@ def offered(*typed: str, incomplete: str) -> list[str]:
 FOCAL = Read("focal", HINTS["focal"].read)
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("exif", "exif"), ("EXIF", "exif"), ("1200", 1200.0), (8.5, 8.5)])
-def test_focal_lengths(typed: object, meant: object) -> None:
-    assert FOCAL.convert(typed, None, None) == meant
-
-
-@pytest.mark.parametrize(("typed", "meant"), [("unknown", "unknown"), ("0.25", 0.25), ("4", 4.0)])
-def test_aspects(typed: str, meant: object) -> None:
-    assert ASPECT.convert(typed, None, None) == meant
-
-
-@pytest.mark.parametrize("typed", ["0.2", "4.1", "nan", "wide", ""])
-def test_what_is_no_aspect(typed: str) -> None:
-    with pytest.raises(click.BadParameter, match=r"expected a number from 0\.25 to 4, or unknown"):
-        ASPECT.convert(typed, None, None)
-
-
 def test_names_of_plugins_are_offered() -> None:
     plugin = Plugin("none", names=lambda: ["geojson", "geometry", "kmz"])
     assert [item.value for item in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
@@ -151,10 +135,6 @@ def test_what_is_rarely_wanted_is_explained_by_all_of_the_help() -> None:
     whole = " ".join(shown("locate", "--help-all").split())
     assert "share of the map's shards" in whole
     assert "worldfile" in whole
-
-
-def test_there_are_no_more_than_twelve_commands() -> None:
-    assert len(COMMANDS) <= 12
 
 
 @pytest.mark.parametrize("name", ["info", "check", "list", "remove"])
