@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from worlds.demo import DRONE, MASKS
 from worlds.models import brightness_model
 
 from roadgeo import open_reference
 from roadgeo.cli import main
-from roadgeo.errors import MaskError, ModelError, PhotographError
-from roadgeo.evaluation.demo import demo_masks
+from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running import photographs, queries
@@ -30,8 +30,6 @@ from roadgeo.storage.geopackage import read_layer
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
-MASK = next(mask for mask in demo_masks() if mask.path.stem == "drone")
-
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -44,7 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
 def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The drone's mask as a photograph: light roads on rough, coloured ground."""
     rng = np.random.default_rng(0)
-    roads = cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE) > 127
+    roads = cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE) > 127
     ground = rng.integers(10, 110, (*roads.shape, 3)).astype(np.uint8)
     ground[..., 1] //= 2
     image = np.where(roads[..., None], np.uint8(225), cv2.GaussianBlur(ground, (0, 0), 1))
@@ -61,26 +59,9 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:
 def offset(document: dict, size: int = 1) -> float:
     """Distance in metres of the middle from where it is."""
     width, height = document["size"]
-    expected = MASK.homography @ [width / 2, height / 2, 1]
+    expected = MASKS["drone"].homography @ [width / 2, height / 2, 1]
     found = np.array(document["homography"]) @ [width / 2, height / 2, 1]
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
-
-
-def test_plugins_alone_have_no_more_ways_however_large_the_photograph(
-    photo: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken: list[str] = []
-
-    def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.note for look in looks)
-        raise MaskError("that is all")
-
-    monkeypatch.setattr(photographs, "locate_looks", note)
-    monkeypatch.setattr(photographs, "_MANY_PIXELS", 1)
-    monkeypatch.setattr(photographs, "call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
-    locate_query(str(photo), [], reading=ReadOptions(segment="always", segmenters=("one", "another")))
-    assert taken
-    assert not any("ways" in item for item in taken)
 
 
 @pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
@@ -211,20 +192,6 @@ def test_a_photograph_is_located(
     assert again["homography"] == document["homography"]
 
 
-def test_a_photograph_with_infrared_is_located(
-    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nobody says that its fourth band is no mask."""
-    colours = np.moveaxis(cv2.imread(str(photo))[..., ::-1], 2, 0)
-    path = tmp_path / "rgbn.tif"
-    size = {"height": colours.shape[1], "width": colours.shape[2]}
-    with rasterio.open(path, "w", driver="GTiff", count=4, dtype="uint8", photometric="MINISBLACK", **size) as dataset:
-        dataset.write(np.concatenate([colours, 255 - colours[:1]]))
-    document = run(capsys, str(path), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path))
-    assert document["status"] == "located"
-    assert offset(document) < 3.0
-
-
 def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
     tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -239,7 +206,7 @@ def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
     assert coarse["status"] == "located"
     assert coarse["size"] == [width, height]
     assert coarse["n_intersections"] > 0.8 * fine["n_intersections"]
-    truth = MASK.homography @ np.diag([2.0, 2.0, 1.0]) @ [width / 2, height / 2, 1]
+    truth = MASKS["drone"].homography @ np.diag([2.0, 2.0, 1.0]) @ [width / 2, height / 2, 1]
     found = np.array(coarse["homography"]) @ [width / 2, height / 2, 1]
     assert np.hypot(*(found[:2] / found[2] - truth[:2] / truth[2])) < 3.0
     assert coarse["gsd_m"] == pytest.approx(2 * fine["gsd_m"], rel=0.02)
@@ -273,7 +240,7 @@ def test_what_was_seen_is_told_and_drawn(
     assert "times the mask's size" not in output.out
     page = (tmp_path / "flight_report.html").read_text()
     assert page.count('<g class="probability off"><image') == 1
-    assert main(["locate", str(MASK.path), "-r", str(porto), "-o", str(tmp_path), "--report"]) == 0
+    assert main(["locate", str(DRONE), "-r", str(porto), "-o", str(tmp_path), "--report"]) == 0
     assert "probability" not in (tmp_path / "drone_report.html").read_text().split("<script>")[0].split("</style>")[1]
 
 
@@ -330,7 +297,7 @@ def test_what_is_seen_is_shown_without_a_map(
 def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> None:
     reading = ReadOptions(threshold=0.4, segmenters=(model,))
     assert queries.look_once(str(photo), (0.6, 1.0), reading).probability is not None
-    assert queries.look_once(str(MASK.path), None, reading).probability is None
+    assert queries.look_once(str(DRONE), None, reading).probability is None
     as_mask = replace(reading, threshold=200.0, segment="never")
     assert queries.look_once(str(photo), None, as_mask).probability is None
 
@@ -338,11 +305,11 @@ def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> N
 def test_what_plugins_and_masks_show(
     tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(photographs, "call_plugin", lambda *_: cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE))
+    monkeypatch.setattr(photographs, "call_plugin", lambda *_: cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE))
     seen = queries.look_once(str(photo), None, ReadOptions(segmenters=("plugin",)))
     assert seen.probability is None
     assert seen.coarser == 1.0
-    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(MASK.path), None, ReadOptions()).mask.roads)
+    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(DRONE), None, ReadOptions()).mask.roads)
     assert main(["vectorize", str(photo), "--segment", "never", "-o", str(tmp_path)]) == 1
     assert "looks like a photograph" in capsys.readouterr().err
     given = ["vectorize", str(photo), "-o", str(tmp_path), "--segmenter", model]
@@ -378,32 +345,6 @@ def test_a_mask_of_the_users_is_not_overwritten(
     assert [path.name for path in tmp_path.iterdir()] == ["flight_mask.tif"]
 
 
-def test_never_means_never(porto: Path, model: str, photo: Path) -> None:
-    import roadgeo
-
-    reference = roadgeo.open_reference(porto)
-    with pytest.raises(PhotographError, match="looks like a photograph"):
-        locate_query(str(photo), [reference], reading=ReadOptions(segment="never", segmenters=(model,)))
-
-
-def test_a_mask_stays_a_mask(porto: Path, model: str) -> None:
-    import roadgeo
-
-    reference = roadgeo.open_reference(porto)
-    sighting = locate_query(str(MASK.path), [reference], reading=ReadOptions(segmenters=(model,)))
-    assert sighting.location.located
-    assert not sighting.of_photograph
-    assert sighting.probability is None
-
-
-def test_without_a_model_it_is_said(porto: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import roadgeo
-
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModelError, match=r"-m pip install onnxruntime"):
-        locate_query(str(photo), [roadgeo.open_reference(porto)])
-
-
 def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[str] = []
 
@@ -415,7 +356,7 @@ def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(photographs, "locate_looks", note)
     monkeypatch.setattr(photographs, "segment", lambda *_: pytest.fail("a mask was shown to a model"))
     with pytest.raises(StopIteration):
-        locate_query(str(MASK.path), [], reading=ReadOptions(fused_with=(str(MASK.path),)))
+        locate_query(str(DRONE), [], reading=ReadOptions(fused_with=(str(DRONE),)))
     assert taken
     assert not any("ways" in item for item in taken)
 
