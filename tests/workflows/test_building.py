@@ -1,7 +1,6 @@
 """Roads to a reference: one builder for the command line and for Python, from whatever holds the roads."""
 
 import geopandas
-import networkx as nx
 import numpy as np
 import pandas as pd
 import pytest
@@ -47,13 +46,6 @@ def test_whom_to_name_is_kept(roads, tmp_path):
 def held(kind, roads):
     """The same roads as a program may hold them, and what else it then says."""
     lines, coordinates = list(roads.geometry), [np.array(line.coords) for line in roads.geometry]
-    if kind == "graph of osmnx":
-        graph = nx.MultiDiGraph(crs="EPSG:4326")
-        for n, (line, highway, tunnel) in enumerate(zip(lines, roads.highway, roads.tunnel, strict=True)):
-            ends = [(f"{n}{side}", dict(zip("xy", line.coords[at], strict=True))) for side, at in (("a", 0), ("b", -1))]
-            graph.add_nodes_from(ends)
-            graph.add_edge(ends[0][0], ends[1][0], 0, geometry=line, highway=highway, tunnel=tunnel)
-        return graph, {}
     if kind == "one array":
         return np.concatenate([np.vstack([part, [np.nan, np.nan]]) for part in coordinates]), {"crs": 4326}
     crs = {"crs": "EPSG:4326"}
@@ -74,7 +66,6 @@ def held(kind, roads):
     [
         "GeoSeries",
         "table without a CRS",
-        "graph of osmnx",
         "shapely lines",
         "array of shapely lines",
         "one shapely geometry",
