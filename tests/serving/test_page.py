@@ -4,8 +4,7 @@ import errno
 import json
 import os
 import re
-import threading
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,22 +12,18 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect, sync_playwright
-from serving.test_server import running
+from serving.test_server import Workers, running
 from support.browser import find_chromium
 
-from roadgeo.evaluation.landscape import Landscape
-from roadgeo.evaluation.noise import NOISE_MODELS
-from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place, Reason
 from roadgeo.reference.reference import Reference
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import Full, _answer
+from roadgeo.serving.workers import _answer
 from roadgeo.workflows import locate
 
-VIEW = ViewOptions(size_px=(900, 900), gsd_m=(1.0, 1.0), heading_deg=(0.0, 360.0), intersections=(25, 1000))
 FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--no-first-run", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader",
@@ -36,46 +31,32 @@ FLAGS = [
 PATIENCE_MS = 60_000
 
 
-class Direct:
-    """Answers as processes do, in the thread that asks: a name that holds "hard" is located with a hint only."""
+class Direct(Workers):
+    """Answers as processes do, in the thread that asks."""
 
-    def __init__(self, references, folder):
-        self.references, self.folder, self.asked = references, folder, []
-        self.places, self.goes_on = threading.Semaphore(3), threading.Event()
-        self.goes_on.set()
-
-    def take_place(self):
-        if not self.places.acquire(blocking=False):
-            raise Full
-        place = ExitStack()
-        place.callback(self.places.release)
-        return place
+    def __init__(self, references):
+        super().__init__(3)
+        self.references = references
 
     def ask(self, asked, say=None, called_off=None):
-        self.asked.append(asked)
-        if asked.wanted:
-            return _answer(asked, self.references)
-        say("finding roads", 0.5)
-        while not self.goes_on.wait(0.02) and not called_off.is_set():
-            pass
+        if not asked.wanted:
+            super().ask(asked, say, called_off)
         return _answer(asked, self.references, say)
 
     def close(self):
-        pass
+        """Serve again: the images stay."""
 
 
 @pytest.fixture(scope="module")
-def served(town, tmp_path_factory):
+def served(town, place):
     """A server of a town, its workers, a mask of it, and where that lies."""
-    network, index = town
-    query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
-    mask = tmp_path_factory.mktemp("page") / "mask.png"
-    cv2.imwrite(str(mask), query.mask)
+    (network, index), (folder, truth) = town, place
     index = replace(index, meta={**index.meta, "attribution": '© <a href="https://maps.example">Mappers</a>'})
-    workers = Direct([Reference(index, network)], tmp_path_factory.mktemp("images"))
-    lonlat = to_lonlat(index.plane.crs, np.array([query.truth.center]))[0]
+    workers = Direct([Reference(index, network)])
+    lonlat = to_lonlat(index.plane.crs, np.array([truth.center]))[0]
     with serving(workers) as server:
-        yield server, workers, mask, lonlat
+        yield server, workers, folder / "mask.png", lonlat
+    Workers.close(workers)
 
 
 def serving(workers, references=None, **options):

@@ -9,7 +9,7 @@ import socket
 import struct
 import threading
 import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -39,8 +39,8 @@ class Workers:
     """Stands for processes: it keeps what it was asked."""
 
     def __init__(self, places=4):
-        self.asked, self.places, self.busy = [], threading.Semaphore(places), threading.Event()
-        self.busy.set()
+        self.asked, self.places, self.goes_on = [], threading.Semaphore(places), threading.Event()
+        self.goes_on.set()
         self._temporary = TemporaryDirectory(prefix="roadgeo-")
         self.folder = Path(self._temporary.name)
 
@@ -54,7 +54,7 @@ class Workers:
     def ask(self, asked, say=None, called_off=None):
         if asked.keeps:
             say("finding roads", 0.5)
-        while not self.busy.wait(0.02) and not called_off.is_set():
+        while not self.goes_on.wait(0.02) and not called_off.is_set():
             pass
         self.asked.append(asked)
         return Answer(200, {**FOUND, "query": asked.name} if asked.name else FOUND)
@@ -80,13 +80,24 @@ def running(server):
         server.close()
 
 
+def get(server, path, headers=None, method="GET", body=None):
+    with closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)) as connection:
+        connection.request(method, path, body, headers or {})
+        answer = connection.getresponse()
+        return answer, answer.read()
+
+
 def ask(server, method, path, body=None, headers=None):
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.request(method, path, body, headers or {})
-    answer = connection.getresponse()
-    content = answer.read()
-    connection.close()
+    answer, content = get(server, path, headers, method, body)
     return answer, json.loads(content) if content else None
+
+
+def wait_until(happens):
+    for _ in range(300):
+        if found := happens():
+            return found
+        time.sleep(0.02)
+    raise AssertionError("it has not happened")
 
 
 def send_raw(server, data, wait_s=5.0):
@@ -234,12 +245,7 @@ def test_a_fault_is_told_and_logged_and_the_next_is_served(caplog):
     with serving(workers) as server:
         answer, document = ask(server, "POST", "/locate", PNG)
         assert (answer.status, document["status"]) == (500, 500)
-        for _ in range(100):  # it is logged once the answer is sent
-            if "KeyError" in caplog.text:
-                break
-            time.sleep(0.05)
-        else:
-            pytest.fail("the fault is not logged")
+        wait_until(lambda: "KeyError" in caplog.text)  # it is logged once the answer is sent
         assert ask(server, "GET", "/health")[0].status == 200
 
 
@@ -315,19 +321,16 @@ def test_slow_senders_are_cut_off():
 
 def test_who_comes_when_it_is_full_is_told_when_to_come_again():
     workers = Workers(places=1)
-    workers.busy.clear()
+    workers.goes_on.clear()
     with serving(workers) as server:
         first = threading.Thread(target=ask, args=(server, "POST", "/locate", PNG))
         first.start()
-        for _ in range(200):
-            if not workers.places._value:
-                break
-            time.sleep(0.01)
+        wait_until(lambda: not workers.places._value)
         answer, _ = ask(server, "POST", "/locate", PNG)
         assert answer.status == 503
         assert int(answer.headers["Retry-After"]) >= 1
         assert ask(server, "GET", "/health")[0].status == 200
-        workers.busy.set()
+        workers.goes_on.set()
         first.join()
         assert ask(server, "POST", "/locate", PNG)[0].status == 200
 
@@ -361,10 +364,7 @@ def test_who_waits_while_the_server_ends_is_told():
     with serving(workers) as server:
         asking = threading.Thread(target=lambda: answers.append(ask(server, "POST", "/locate", PNG)))
         asking.start()
-        for _ in range(200):
-            if workers.places._value < 4:
-                break
-            time.sleep(0.01)
+        wait_until(lambda: workers.places._value < 4)
         time.sleep(0.1)
         server.shutdown()
         asking.join(10.0)
@@ -474,12 +474,9 @@ LATER = {"Prefer": "respond-async"}
 
 
 def wait_for(server, job, *states):
-    for _ in range(300):
-        document = ask(server, "GET", f"/jobs/{job}")[1]
-        if document["status"] in states:
-            return document
-        time.sleep(0.02)
-    raise AssertionError(document)
+    return wait_until(
+        lambda: (document := ask(server, "GET", f"/jobs/{job}")[1]) and document["status"] in states and document
+    )
 
 
 def finished(server, body=PNG, headers=LATER):
@@ -491,7 +488,7 @@ def finished(server, body=PNG, headers=LATER):
 
 def test_who_prefers_not_to_wait_gets_a_job():
     workers = Workers()
-    workers.busy.clear()
+    workers.goes_on.clear()
     with serving(workers) as server:
         answer, job = ask(server, "POST", "/locate?gsd=1,2", PNG, LATER)
         assert answer.status == 201
@@ -499,7 +496,7 @@ def test_who_prefers_not_to_wait_gets_a_job():
         reported = wait_for(server, job["jobID"], "running")
         assert (reported["message"], reported["progress"]) == ("finding roads", 50)
         assert ask(server, "GET", f"/jobs/{job['jobID']}/results")[0].status == 404
-        workers.busy.set()
+        workers.goes_on.set()
         assert wait_for(server, job["jobID"], "successful")["progress"] == 100
         assert ask(server, "GET", f"/jobs/{job['jobID']}/results")[1] == {"location": FOUND}
         assert ask(server, "GET", "/jobs")[0].status == 404
@@ -507,7 +504,7 @@ def test_who_prefers_not_to_wait_gets_a_job():
 
 def test_progress_is_told_as_it_is_made():
     workers = Workers()
-    workers.busy.clear()
+    workers.goes_on.clear()
     with serving(workers) as server:
         job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
         connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
@@ -519,7 +516,7 @@ def test_progress_is_told_as_it_is_made():
             if output.startswith(b"data: "):
                 states.append(json.loads(output[6:])["status"])
                 if states[-1] == "running":
-                    workers.busy.set()
+                    workers.goes_on.set()
             output = answer.readline()
         connection.close()
     assert states[-1] == "successful"
@@ -539,17 +536,14 @@ def test_a_job_that_fails_says_why():
 
 def test_a_job_is_called_off_and_forgotten():
     workers = Workers(places=1)
-    workers.busy.clear()
+    workers.goes_on.clear()
     with serving(workers) as server:
         job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
         assert ask(server, "POST", "/locate", PNG)[0].status == 503
         assert ask(server, "DELETE", f"/jobs/{job}")[1]["status"] == "dismissed"
         assert ask(server, "GET", f"/jobs/{job}")[0].status == 404
-        for _ in range(100):
-            if workers.places._value:
-                break
-            time.sleep(0.02)
-        workers.busy.set()
+        wait_until(lambda: workers.places._value)
+        workers.goes_on.set()
         assert ask(server, "POST", "/locate", PNG)[0].status == 200
         assert not list(server._service.workers.folder.iterdir())
 
@@ -580,15 +574,6 @@ def test_other_sites_get_nothing():
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 HTML = {"Accept": "text/html,*/*"}
-
-
-def get(server, path, headers=None):
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.request("GET", path, headers=headers or {})
-    answer = connection.getresponse()
-    content = answer.read()
-    connection.close()
-    return answer, content
 
 
 def test_the_page_runs_no_script_but_its_own():

@@ -28,9 +28,6 @@ from worlds.pngs import png
 
 from roadgeo.cli import main
 from roadgeo.errors import IndexFormatError, ModelError
-from roadgeo.evaluation.landscape import Landscape
-from roadgeo.evaluation.noise import NOISE_MODELS
-from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -41,18 +38,8 @@ from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
 
-VIEW = ViewOptions(size_px=(900, 900), gsd_m=(1.0, 1.0), heading_deg=(0.0, 360.0), intersections=(25, 1000))
-
-
-@pytest.fixture(scope="module")
-def place(town, tmp_path_factory):
-    """A reference on disk, and a mask of it."""
-    network, index = town
-    folder = tmp_path_factory.mktemp("served")
-    Reference(index, network).save(folder / "town.gpkg")
-    query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
-    cv2.imwrite(str(folder / "mask.png"), query.mask)
-    return folder, query.truth
+#: The program that serves.
+SERVE = [sys.executable, "-m", "roadgeo", "serve"]
 
 
 def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
@@ -272,8 +259,7 @@ def test_a_missing_reference_is_said(tmp_path):
 
 def test_the_command_serves_until_it_is_interrupted(place):
     folder, truth = place
-    program = "import sys; from roadgeo.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "serve", "-r", str(folder / "town.gpkg"), "--port", "0"]
+    command = [*SERVE, "-r", str(folder / "town.gpkg"), "--port", "0"]
     peer = listening() if has_pymavlink() else nullcontext(("", []))
     with (
         peer as (url, heard),
@@ -312,8 +298,7 @@ def test_the_command_serves_until_it_is_interrupted(place):
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_neither_processes_nor_images_outlive_a_server_that_is_killed(place, tmp_path):
-    program = "import sys; from roadgeo.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "serve", "-r", str(place[0] / "town.gpkg"), "--port", "0", "-j", "2"]
+    command = [*SERVE, "-r", str(place[0] / "town.gpkg"), "--port", "0", "-j", "2"]
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment
@@ -332,11 +317,8 @@ def test_neither_processes_nor_images_outlive_a_server_that_is_killed(place, tmp
 
 @pytest.mark.parametrize("options", [["--host", "0.0.0.0"], ["--token-file", os.devnull]])
 def test_others_may_ask_with_a_token_only(options):
-    program = "import sys; from roadgeo.cli import main; sys.exit(main())"
     environment = {name: value for name, value in os.environ.items() if name != "ROADGEO_TOKEN"}
-    done = subprocess.run(
-        [sys.executable, "-c", program, "serve", *options], capture_output=True, text=True, env=environment, check=False
-    )
+    done = subprocess.run([*SERVE, *options], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 2
     assert "token" in done.stderr
 
