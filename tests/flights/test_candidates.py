@@ -3,24 +3,11 @@
 import numpy as np
 import pytest
 
-from examples.simulated_flights import FlightOptions, simulate_flight
-from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.candidates import PER_LOOK, Candidates, Look
 from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
-from roadgeo.reference.reference import Reference
-
-FLIGHT = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
-
-
-@pytest.fixture(scope="module")
-def flown(town):
-    network, index = town
-    flight = simulate_flight(Landscape.from_network(network), FLIGHT, 1)
-    return flight, [RoadMask(mask > 127) for mask in flight.masks()], Reference(index, network)
 
 
 def look_at(flown, count, searched):

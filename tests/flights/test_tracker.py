@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flights.conftest import OPTIONS
 from worlds.lattices import lattice
 
-from examples.simulated_flights import FlightOptions, simulate_flight
+from examples.simulated_flights import simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import fix_of
 from roadgeo.flights.pose import start
@@ -16,20 +17,14 @@ from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, follow, lates
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
 
-OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
-
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def flight(town):
-    network, index = town
-    flown = simulate_flight(Landscape.from_network(network), OPTIONS, 1)
-    frames = [
-        FlightFrame(k, f"{k}", float(k), RoadMask(mask > 127), flown.motion[k] if k else None)
-        for k, mask in enumerate(flown.masks())
-    ]
-    return flown, frames, Reference(index, network)
+def flight(flown):
+    seen, masks, reference = flown
+    frames = [FlightFrame(k, f"{k}", float(k), mask, seen.motion[k] if k else None) for k, mask in enumerate(masks)]
+    return seen, frames, reference
 
 
 def error(flown, one):
