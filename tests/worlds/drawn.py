@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import shapely
 
-__all__ = ["CRS", "ORIGIN", "draw", "lattice", "mapped", "roads_of", "town", "view"]
+__all__ = ["CRS", "ORIGIN", "camera", "draw", "lattice", "mapped", "roads_of", "town", "view"]
 
 CRS = "EPSG:32619"
 #: Where the corner of a made-up map lies, metres.
@@ -37,6 +37,38 @@ def roads_of(streets: list[np.ndarray]):
     return gpd.GeoSeries([shapely.LineString(street + ORIGIN) for street in streets], crs=CRS)
 
 
+def camera(
+    center: tuple[float, float],
+    size: tuple[int, int] = (1000, 1000),
+    gsd_m: float = 1.0,
+    tilt_deg: float = 0.0,
+    azimuth_deg: float = 0.0,
+    heading_deg: float = 0.0,
+    focal_px: float = 1000.0,
+) -> np.ndarray:
+    """Homography from the query plane (pixels, y up) to metres, of a pinhole whose axis meets the ground at `center`.
+
+    The axis is tilted from the vertical towards `azimuth_deg`, clockwise from north; before tilting, the image's up
+    points to `heading_deg`. `gsd_m` is measured across the axis at the frame's middle.
+    """
+    heading, azimuth, tilt = np.radians([heading_deg, azimuth_deg, tilt_deg])
+
+    def turn(clockwise: float) -> np.ndarray:
+        c, s = np.cos(clockwise), np.sin(clockwise)
+        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
+    # Rays of the camera over the ground, z up: (x, y, -f) for a camera that looks straight down with up to the north.
+    rays = turn(azimuth) @ lean.T @ turn(heading - azimuth)
+    rays = rays @ np.array([[1, 0, -size[0] / 2], [0, 1, size[1] / 2], [0, 0, -focal_px]])
+    distance = gsd_m * focal_px
+    axis = rays @ (size[0] / 2, -size[1] / 2, 1) / focal_px
+    eye = -distance * axis
+    matrix = np.array([-eye[2] * rays[0] + eye[0] * rays[2], -eye[2] * rays[1] + eye[1] * rays[2], rays[2]])
+    matrix = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]]) @ matrix
+    return matrix / (matrix[2] @ (size[0] / 2, -size[1] / 2, 1))
+
+
 def view(
     center: tuple[float, float],
     size: tuple[int, int] = (1000, 1000),
@@ -46,21 +78,10 @@ def view(
 ) -> np.ndarray:
     """Return the homography from pixels (column, row; corners) to metres of a pinhole, tilted towards the image's up.
 
-    The focal length is the frame's longer side; `gsd_m` is measured across the axis at the frame's middle.
+    The focal length is the frame's longer side.
     """
-    focal = float(max(size))
-    heading, tilt = np.radians([heading_deg, tilt_deg])
-    rays = np.array([[1, 0, -size[0] / 2], [0, -1, size[1] / 2], [0, 0, focal]])  # x right, y up, ahead
-    ahead = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
-    up = np.array([0.0, np.cos(tilt), np.sin(tilt)])
-    c, s = np.cos(heading), np.sin(heading)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    to_ground = turn @ np.column_stack([[1.0, 0.0, 0.0], up, ahead]) @ rays
-    eye = -gsd_m * focal * (turn @ ahead)
-    matrix = np.array([eye[0] * to_ground[2] - eye[2] * to_ground[0], eye[1] * to_ground[2] - eye[2] * to_ground[1]])
-    matrix = np.vstack([matrix, to_ground[2]])
-    matrix = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]]) @ matrix
-    return matrix / (matrix[2] @ (size[0] / 2, size[1] / 2, 1))
+    flip = np.diag([1.0, -1.0, 1.0])
+    return camera(center, size, gsd_m, tilt_deg, heading_deg, heading_deg, float(max(size))) @ flip
 
 
 def mapped(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from roadgeo.matching.scene import Scene, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
-from worlds.drawn import mapped
+from worlds.drawn import camera, mapped
 
 __all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
 
@@ -50,38 +50,6 @@ def random_lines(seed: int, side: float = 3000.0, spacing: float = 120.0) -> lis
 def random_network(seed: int, side: float = 3000.0, spacing: float = 120.0) -> RoadNetwork:
     """The same as a reference has it."""
     return build_network(random_lines(seed, side, spacing), PLANE, {"name": f"town {seed}"})
-
-
-def camera(
-    center: tuple[float, float],
-    size: tuple[int, int] = (1000, 1000),
-    gsd_m: float = 1.0,
-    tilt_deg: float = 0.0,
-    azimuth_deg: float = 0.0,
-    heading_deg: float = 0.0,
-    focal_px: float = 1000.0,
-) -> np.ndarray:
-    """Homography from the query plane (pixels, y up) to metres, of a pinhole whose axis meets the ground at `center`.
-
-    The axis is tilted from the vertical towards `azimuth_deg`, clockwise from north; before tilting, the image's up
-    points to `heading_deg`. `gsd_m` is measured across the axis at the frame's middle.
-    """
-    heading, azimuth, tilt = np.radians([heading_deg, azimuth_deg, tilt_deg])
-
-    def turn(clockwise: float) -> np.ndarray:
-        c, s = np.cos(clockwise), np.sin(clockwise)
-        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-
-    lean = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
-    # Rays of the camera over the ground, z up: (x, y, -f) for a camera that looks straight down with up to the north.
-    rays = turn(azimuth) @ lean.T @ turn(heading - azimuth)
-    rays = rays @ np.array([[1, 0, -size[0] / 2], [0, 1, size[1] / 2], [0, 0, -focal_px]])
-    distance = gsd_m * focal_px
-    axis = rays @ (size[0] / 2, -size[1] / 2, 1) / focal_px
-    eye = -distance * axis
-    matrix = np.array([-eye[2] * rays[0] + eye[0] * rays[2], -eye[2] * rays[1] + eye[1] * rays[2], rays[2]])
-    matrix = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]]) @ matrix
-    return matrix / (matrix[2] @ (size[0] / 2, -size[1] / 2, 1))
 
 
 @dataclass(frozen=True)
