@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 import shapely
+from running.test_cluster import draw
 from worlds.fenway import write_vector
 from worlds.scenes import PLANE, random_lines
 
@@ -57,11 +57,7 @@ def town(tmp_path_factory):
         ("c", "hamlet", 600.0),
         ("d", "stranger", 0.0),
     ):
-        drawn = np.zeros((1000, 1000), np.uint8)
-        for line in lines[name]:
-            xy = (np.array(line.coords) - corner) * (1, -1) + (0, 1000)
-            cv2.polylines(drawn, [np.round(xy).astype(np.int32)], False, 255, 9)
-        cv2.imwrite(str(folder / f"{mask}.png"), drawn)
+        draw(str(folder / f"{mask}.png"), lines[name], corner)
     (folder / "e.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
     return folder
 

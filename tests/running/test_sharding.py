@@ -3,12 +3,13 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import shapely
 from worlds.fenway import write_vector
-from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, scene_of
+from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
 from roadgeo.api import build_reference
 from roadgeo.cli import main
@@ -69,12 +70,9 @@ def locate(place, *references, near=None, within=None, **sight):
     return decide(query, search_references(query, parts, options, 60.0), options)
 
 
-def towns_network(cache=[]):  # noqa: B006 (made once)
-    from worlds.scenes import random_network
-
-    if not cache:
-        cache.append(random_network(5, SIDE))
-    return cache[0]
+@cache
+def towns_network():
+    return random_network(5, SIDE)
 
 
 def gap(location, place):
@@ -108,8 +106,6 @@ def test_shards_answer_as_the_whole_does(whole, sharded, place):
 
 
 def test_a_stranger_is_refused_once_for_all_shards(sharded):
-    from worlds.scenes import random_network
-
     graph = look(random_network(77, 2000.0), camera((1000, 1000)), sight=Sight(1.5))
     query = Query("q", scene_of(graph), graph, Seconds())
     options = replace(LocateOptions(), effort="quick")
