@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from worlds.lattices import beside, contest
@@ -93,16 +92,6 @@ def test_a_rival_that_explains_more_takes_over(broken):
 def test_where_all_blocks_are_equal_nothing_leads(even):
     assert stand(even, even[0]).log10_lead < 0.5
     assert stand(even, even[0], beside(even[0], even[2])).log10_lead < 0.5
-
-
-def drawn(index, matrix, size):
-    """Draw all streets of the map that a camera sees, 7 pixels wide."""
-    mask = np.zeros(size[::-1], np.uint8)
-    ends = Homography(np.linalg.inv(matrix))(index.segments.reshape(-1, 2).astype(float)) * (1, -1)
-    for line in ends.reshape(-1, 2, 2):
-        if (np.abs(line) < 5000.0).all():
-            cv2.polylines(mask, [np.round(line).astype(np.int32)], False, 255, 7)
-    return mask
 
 
 @pytest.mark.slow
