@@ -22,7 +22,7 @@ _OPTIONS = (
         "pixels are not square."),
     row("--also products", "NAME", OTHERS,
         "Write a further form, as of `roadgeo locate`: points, gcps, geojson, kmz ... Repeatable.",
-        type=Plugin("roadgeo.outputs", names=offered), multiple=True),
+        type=Plugin(offered), multiple=True),
     take("crs", "resolution", "resampling", "compression", rare=False),
     take("quiet"),
 )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo._text import counted
-from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, row, take
+from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, installed, row, take
 from roadgeo.cli.printing import echo, is_set, tell
 from roadgeo.cli.shards import build_in_shards, shard_options, tell_built
 
@@ -32,7 +33,7 @@ _OPTIONS = (
         "Take roads from a file or a folder of files. Repeatable.", type=click.Path(), multiple=True),
     row("--source plugin", "NAME:WHERE", SOURCE,
         "Take roads from a plugin; `roadgeo --plugins` lists them.",
-        type=Plugin("roadgeo.sources", has_argument=True), rare=True),
+        type=Plugin(partial(installed, "roadgeo.sources"), has_argument=True), rare=True),
     row("--layer", "NAME", SOURCE, "Layer of --roads, where there are several."),
     row("--crs", "CRS", SOURCE, "CRS of --roads, where the file does not say, such as EPSG:26986.", type=CRS),
     row("--kinds", ("main", "drivable", "vehicles", "all"), ROADS,

@@ -135,7 +135,7 @@ _OPTIONS = (
         type=click.Path(), multiple=True),
     row("--also products", "NAME", RESULTS,
         "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
-        type=Plugin("roadgeo.outputs", names=offered), multiple=True),
+        type=Plugin(offered), multiple=True),
     take("json", group=RESULTS),
     row("--skip-existing/--overwrite", "", RESULTS,
         "Keep results younger than their images, or make them anew, the default.", default=False, rare=True),

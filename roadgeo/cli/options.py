@@ -40,6 +40,7 @@ __all__ = [
     "each",
     "find_tasks",
     "hinted",
+    "installed",
     "make_cluster",
     "make_options",
     "n_threads",
@@ -217,27 +218,13 @@ class Read(click.ParamType):  # type: ignore[type-arg]  # generic only in late v
 class Plugin(click.ParamType):  # type: ignore[type-arg]
     """The name of a plugin, and with `has_argument` a colon and its argument: "osm:Boston, MA".
 
-    `names` gives the names that are known, where there are more than the plugins'; a file that ends so is taken too.
+    `names` gives the names that are known; a file that ends as `file_ending` says is taken too.
     """
 
     name = "plugin"
 
-    def __init__(
-        self,
-        group: str,
-        *,
-        has_argument: bool = False,
-        names: Callable[[], Sequence[str]] | None = None,
-        file_ending: str = "",
-    ) -> None:
-        self.group, self.has_argument, self.names, self.file_ending = group, has_argument, names, file_ending
-
-    def _known(self) -> Sequence[str]:
-        if self.names is not None:
-            return self.names()
-        from roadgeo.plugins import find_plugins
-
-        return sorted(find_plugins(self.group))
+    def __init__(self, names: Callable[[], Sequence[str]], has_argument: bool = False, file_ending: str = "") -> None:
+        self.names, self.has_argument, self.file_ending = names, has_argument, file_ending
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Check that it is there; nothing of it is imported or read.
@@ -253,7 +240,7 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
                 self.fail(f"no such model file: {text}", param, ctx)
             return text
         name, colon, _ = text.partition(":")
-        known = self._known()
+        known = self.names()
         if name not in known or bool(colon) != self.has_argument:
             expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in known)
             self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
@@ -263,7 +250,14 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         """Offer the names that begin so."""
         from click.shell_completion import CompletionItem
 
-        return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
+
+
+def installed(group: str) -> list[str]:
+    """Name the plugins of a group."""
+    from roadgeo.plugins import find_plugins
+
+    return sorted(find_plugins(group))
 
 
 def _read_bands(text: str) -> tuple[int, ...]:
@@ -339,7 +333,7 @@ _SHARED = {
     "segmenters": row("--segmenter segmenters", "NAME|MODEL.onnx", IMAGE,
         "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness, GeoDeep "
         "or STAC describe them. Several are fused. Default: the model that ships.",
-        type=Plugin("roadgeo.segmenters", file_ending=".onnx"), multiple=True, rare=True),
+        type=Plugin(partial(installed, "roadgeo.segmenters"), file_ending=".onnx"), multiple=True, rare=True),
     "class_name": row("--class class_name", "NAME|N", IMAGE,
         "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True),
     "fuse": row("--fuse", "", IMAGE,

@@ -30,7 +30,7 @@ FOCAL = Read("focal", HINTS["focal"].read)
 
 
 def test_names_of_plugins_are_offered() -> None:
-    plugin = Plugin("none", names=lambda: ["geojson", "geometry", "kmz"])
+    plugin = Plugin(lambda: ["geojson", "geometry", "kmz"])
     assert [item.value for item in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
 
 
