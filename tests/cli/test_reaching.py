@@ -17,6 +17,7 @@ from roadgeo.cli.vectorize import vectorize_command
 from roadgeo.cli.verify import _settings, verify_command
 from roadgeo.flights.frames import FrameOptions
 from roadgeo.matching.hints import HINTS
+from roadgeo.outputs.registry import REGISTRY
 from roadgeo.running.options import ReadOptions
 
 
@@ -45,6 +46,10 @@ def read_in(module: str) -> set[str]:
         taken |= {field.name for field in fields(ReadOptions)} | {"allow_mirror"}
     if "make_cluster" in loaded:
         taken |= {"engine", "scheduler", "divide_map"}
+    if "find_tasks" in loaded:
+        taken |= {"fuse", "page", "recursive"}
+    if "REGISTRY" in loaded:
+        taken |= {output.option.removeprefix("--") for output in REGISTRY.values()}
     if "hinted" in loaded:
         taken |= {hint.goes_to for hint in HINTS.values()}
     return taken
