@@ -169,15 +169,18 @@ class Rivals:
         gsd_m = sampling(ranked[0].matrix, estimator.scene.size)
         best = max(ranked, key=lambda model: estimator.picture(model, gsd_m).weigh(model.matrix))
         for _ in range(_MOST_TURNS):
+            estimator.refine_whole(best)
             standing = self._seen(estimator, best, ranked)
             if standing.rival is None or not standing.is_beaten:
                 break
             best = self._take(estimator, standing.rival, ranked)
-        return standing
+        if estimator.anywhere is None:
+            return standing
+        free = self._seen(estimator.anywhere, standing.model, [standing.model])  # see `_compare`
+        return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
 
     def _seen(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
         """Compare a place with those that were met, and with those around, by the picture."""
-        estimator.refine_whole(best)
         picture = estimator.picture(best, sampling(best.matrix, estimator.scene.size))
         apart_m, middle = max(_BESIDE_M, _BESIDE_PX * picture.gsd_m), estimator.center(best)
         others = [

@@ -288,3 +288,12 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: Standing(here, None, by_roads))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: Standing(there, None, by_picture))
     assert Rivals({item: estimator}, Ledger(), NEEDED).standing(item).log10_lead == pytest.approx(lead)
+
+
+def test_a_hint_never_lowers_the_lead_by_the_picture(plain, monkeypatch):
+    truth, index, evidence = plain
+    x, y = Homography(truth)(evidence.scene.center)
+    hinted = TripleEstimator(evidence.scene, index, near=(x, y, 100.0))
+    hinted.verified.append(Hypothesis.at(truth, evidence.scene, index))
+    monkeypatch.setattr(Rivals, "_seen", lambda _, at, best, *__: Standing(best, None, 3.0 if at.near is None else 1.0))
+    assert Rivals({}, Ledger(), NEEDED)._by_picture(hinted).log10_lead == 3.0
