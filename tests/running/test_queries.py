@@ -250,7 +250,7 @@ def test_no_scale_is_looked_for_in_vain(
 ) -> None:
     """Where the file states one it comes first; where none is known, what was seen on the way is taken."""
     calls = []
-    monkeypatch.setattr(scales, "_WHOLE_TILES", 4.0)  # no scale that may be the best is shown in part
+    monkeypatch.setattr(scales, "_TRIED_TILES", 4.0)  # no scale that may be the best is shown in part
     monkeypatch.setattr(photographs, "estimate_gsd", lambda _: stated)
     monkeypatch.setattr(photographs, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
     monkeypatch.setattr(

@@ -110,6 +110,7 @@ class OnnxModel:
             It fails, or needs too much memory or time.
         """
         options = _without_telemetry().RunOptions()
+        options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")  # a search follows
         watch = threading.Timer(_MAX_SECONDS, setattr, (options, "terminate", True))
         watch.daemon = True
         watch.start()

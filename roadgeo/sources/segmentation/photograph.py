@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import cv2
@@ -76,6 +77,7 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
         chosen = _choose_bands(dataset, name) if bands is None else _require_bands(dataset, name, bands)
         stretch = _find_stretch(dataset, chosen, name)
 
+        @lru_cache(maxsize=1)  # where there is ground is found first, and a picture of one tile is that read again
         def read(
             left: float, top: float, width: float, height: float, shape: tuple[int, int]
         ) -> tuple[AnyArray, BoolArray]:

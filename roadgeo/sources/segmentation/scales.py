@@ -34,7 +34,7 @@ _BRIDGED = 1.5  # a little more than half a step
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
 _MOST_ENLARGED = 4.0  # along a side; beyond it time grows, and no more roads are seen
-_WHOLE_TILES = 1.875  # side, in tiles, up to which all is tried: 2 x 2 of them, overlapping by an eighth, cover it
+_TRIED_TILES = 1.875  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
@@ -80,9 +80,7 @@ def rank_scales(
         if hopeless:
             found[scale], worth[scale] = None, -scale
             continue
-        tiles = max(part.height / network.seen[0], part.width / network.seen[1]) * scale
-        size = [round((_WHOLE_TILES if tiles <= _WHOLE_TILES else 1.0) * side / scale) for side in network.seen]
-        part, same_ground = _most_roads(part, before, size)
+        part, same_ground = _most_roads(part, before, [round(_TRIED_TILES * side / scale) for side in network.seen])
         before, shown = None, _cut(photograph, part)
         with suppress(MaskError):  # no ground
             before = segment(shown, network, scale)
@@ -92,11 +90,14 @@ def rank_scales(
         found[scale] = before if is_whole else None
         cost = _COST_OF_SEARCH + (0 if is_whole else math.prod(map_shape(photograph, scale)))
         worth[scale] = promise / math.sqrt(cost)
-        most, seen_anywhere = max(most, promise), max(seen_anywhere, intersections)
+        seen_anywhere = max(seen_anywhere, intersections)
         # Finer scales are not tried beyond one that promises clearly less than the best: there roads fall apart. Those
-        # that would be shown in part only, the dearest, are not tried beyond any that promises less.
-        doubt = math.sqrt(promise) if 2 * tiles <= _WHOLE_TILES else 0.0
-        hopeless = seen_anywhere >= 1.0 and promise + doubt < most
+        # of which only a part would be shown, the dearest, are tried only if the last one promises clearly more.
+        is_dear = any(
+            2 * scale * side > _TRIED_TILES * tile for side, tile in zip(part[:1:-1], network.seen, strict=True)
+        )
+        falls = promise < most + math.sqrt(most) if is_dear else promise + math.sqrt(promise) < most
+        most, hopeless = max(most, promise), seen_anywhere >= 1.0 and falls
     if seen_anywhere < 1.0:  # narrow roads are seen at the finest scale first
         return {scale: found[scale] for scale in reversed(scales)}
     return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}

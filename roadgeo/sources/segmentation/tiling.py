@@ -27,6 +27,7 @@ MAX_MAP_PIXELS = 1_000_000_000
 _WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))  # MAX_WAYS of them
 #: No model is surer than this where ways are averaged: one of them would outweigh all others.
 _SURE = np.float32(1e-4)
+_LONGER = 4 / 3  # a picture that much longer than a tile is one tile, if it may be: two would mostly overlap
 
 
 def map_shape(photograph: Photograph, scale: float, step: int = 1) -> tuple[int, int]:
@@ -133,9 +134,9 @@ def _seen(network: Network, shape: tuple[int, int]) -> _Seen:
 
 
 def _least(length: int, tile: int, overlap: float) -> int:
-    """Return the least side of as many tiles as cover a length with ones of side `tile`."""
-    side = length / (1 + (len(_starts(length, tile, overlap)) - 1) * (1 - overlap))
-    return min(tile, TILE_STEP * math.ceil(side / TILE_STEP))
+    """Return the least side of as many tiles as cover a length with ones of side `tile`, or of one a little longer."""
+    n_more = 0 if length <= _LONGER * tile else len(_starts(length, tile, overlap)) - 1
+    return TILE_STEP * math.ceil(length / (1 + n_more * (1 - overlap)) / TILE_STEP)
 
 
 def _blend(
