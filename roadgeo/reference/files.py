@@ -94,7 +94,7 @@ def write_reference(
     path : path
         Either file, or what they have in common.
     network : RoadNetwork
-        As `network_file.as_stored` gives it, so that the index is the one that the GeoPackage would give.
+        As `roads.network.as_stored` gives it, so that the index is the one that the GeoPackage would give.
     parts : (meta, arrays)
         The index of that network.
     say : Say
