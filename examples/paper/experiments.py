@@ -21,7 +21,8 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 from roadgeo.evaluation.trials import QuerySet, Trial, run_trials
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.matching.index import build_index
-from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.matching.pairs import PairIndex, build_pair_index
+from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import read_network
@@ -110,7 +111,7 @@ class PairLocator:
     def open(self) -> Callable[[Any], dict[str, Any]]:
         """Build the paper's tables."""
         network = read_network(self.reference)
-        table = build_pair_index(network.intersections, self.options)
+        table = build_pair_index(network.intersections, self.options.d_max_m)
         return lambda mask: self._locate(mask, network, table)
 
     def _locate(self, mask: Any, network: RoadNetwork, table: PairIndex) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import experiments as paper
 import numpy as np
 
 from roadgeo.evaluation.trials import DrawnMasks
-from roadgeo.matching.paper import build_pair_index
+from roadgeo.matching.pairs import build_pair_index
 
 
 def main() -> None:
@@ -22,7 +22,7 @@ def main() -> None:
     parser = paper.arguments(__doc__, queries=50)
     options = parser.parse_args()
     area = paper.search_area(options.reference, options.out)
-    table = build_pair_index(paper.read_network(area).intersections, paper.PAIR)
+    table = build_pair_index(paper.read_network(area).intersections)
     keys = list(table.tuples)
     counts = np.array([len(item.pairs) for item in table.tuples.values()])
     order = np.argsort(-counts)

@@ -10,16 +10,15 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import BoolArray, FloatArray
-from roadgeo.geometry.camera import CameraFault, CameraOptions, CameraPose, pose, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, CameraPose, pose
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import from_lonlat, to_lonlat
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
@@ -30,10 +29,11 @@ from roadgeo.matching.methods import Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import MIN_COS, Query, Scene
 from roadgeo.matching.search import Search
+from roadgeo.matching.truth import TruthStory, finite_or_none, tell_truth, true_place
 from roadgeo.matching.verdict import center_of, decide
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthStory", "tell"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
 
 SCHEMA = "roadgeo.explanation/1"
 
@@ -45,11 +45,6 @@ _USUAL_INTERSECTIONS = 6
 _MAX_REFUSED, _MAX_ELSEWHERE = 200, 20
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
-#: Distance of a rough proposal's middle from the truth, in halves of the frame's diagonal, and at least in metres.
-_ROUGHLY, _AT_LEAST_M = 0.25, 50.0
-#: Larger pixels do not extend the distance from the map at which a place counts as off it.
-_LARGE_PIXEL_M = 5.0
-
 #: Messages for stages without a result.
 _NOTHING = {
     "anchors": "no intersection has three neighbours and tangents that make usable tuples",
@@ -59,16 +54,6 @@ _NOTHING = {
     "on_roads": "wherever tuples agree, the roads around them do not",
     "survived": "whatever was followed outwards met too few intersections where they should be",
 }
-#: The stage that lost the true place, and how, by the last one that met it.
-_LOST = {
-    "camera": ("camera", "grew, but the camera's limits refused it"),
-    "verified": ("verified", "grew, but could not be refined to the map's roads"),
-    "survived": ("verified", "grew, but was not among the best of its intersection"),
-    "on_roads": ("survived", "was proposed, but what was followed outwards from there did not fit"),
-    "proposals": ("on_roads", "was proposed, but the roads around the intersection did not agree"),
-    "": ("proposals", "was never proposed: no intersection and its neighbours are intact enough"),
-}
-_MET = ("proposals", "on_roads", "survived", "camera", "verified")
 
 
 @dataclass(frozen=True)
@@ -118,7 +103,7 @@ class RejectedPlace:
         found = model.found
         return {
             "why": self.why,
-            "log10_odds": _finite(self.scored.log10_odds),
+            "log10_odds": finite_or_none(self.scored.log10_odds),
             "center": {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
             "footprint_lonlat": self.footprint_lonlat.tolist(),
             "gsd_m": camera.gsd_m,
@@ -132,32 +117,9 @@ class RejectedPlace:
                 "roads_of_mask": found.forward,
                 "roads_of_map": found.backward,
             },
-            "log10_likelihood": _finite(model.log10_likelihood),
+            "log10_likelihood": finite_or_none(model.log10_likelihood),
             "nearby": self.nearby,
         }
-
-
-@dataclass(frozen=True)
-class TruthStory:
-    """The fate of the true place on one reference.
-
-    Attributes
-    ----------
-    lost_at : str or None
-        The stage that lost it: "map", "proposals", "on_roads", "survived", "camera", "verified", "odds" or "margin";
-        None if the mask was located there. `said` is the same in a sentence.
-    counts : dict
-        The number of times the place was met at "proposals", "on_roads", "survived", "camera" (refused) and "verified".
-    log10_odds : float or None
-        Its best score.
-    """
-
-    lon: float
-    lat: float
-    lost_at: str | None
-    said: str
-    counts: dict[str, int]
-    log10_odds: float | None
 
 
 @dataclass(frozen=True)
@@ -259,7 +221,7 @@ def tell(query: Query, found: Found, options: LocateOptions) -> Story:
         counts = {fault.value: times for fault, times in course.refusals.most_common()}
         starved, missing = (None, ()) if located else (course.starved, tuple(course.missing()))
         story = Story(name, result.stopped, needed, course.funnel, counts, starved, missing, course.places)
-    truth = _true_place(query.name, options)
+    truth = true_place(query.name, options)
     if truth is None:
         return story
     fate = tell_truth(truth, events, location, options)
@@ -412,10 +374,6 @@ class _Course:
         return lines or ["agreement: nothing on this map is like the mask; another map may be needed"]
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _number(value: float) -> str:
     """Write a number to one digit, and never -0.0."""
     return f"{round(value, 1) + 0.0:.1f}"
@@ -439,90 +397,3 @@ def _weakest(place: RejectedPlace) -> str:
     if model.found is None:
         return "nothing could be compared"
     return f"its roads explain 10^{_number(model.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
-
-
-# --- the true place ---------------------------------------------------------------------------------------------------
-
-
-def _true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
-    """Return longitude and latitude of a mask's true place if it is given."""
-    for name, lon, lat in options.truths:
-        if not name or Path(mask).as_posix().endswith(name):
-            return lon, lat
-    return None
-
-
-def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, options: LocateOptions) -> TruthStory:
-    """Describe the stage that lost the true place; `location` is the answer on this reference."""
-    if events.estimator is None:
-        return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_MET, 0), None)
-    there = _TruePlace(events.estimator, lonlat)
-    return there.story(*there.met(events), location, options.min_log10_odds)
-
-
-class _TruePlace:
-    """The true place on the map that was searched."""
-
-    def __init__(self, estimator: TripleEstimator, lonlat: tuple[float, float]) -> None:
-        self.estimator, self.lonlat = estimator, lonlat
-        self.xy = np.asarray(from_lonlat(estimator.index.plane, np.array([lonlat]))[0], float)
-
-    def met(self, events: Events) -> tuple[dict[str, int], list[CameraFault], float]:
-        """Return the number of times each stage met it, the camera's objections to it, and its best score."""
-        counts, scene, index = dict.fromkeys(_MET, 0), self.estimator.scene, self.estimator.index
-        for proposals, _, kept in events.of("screened"):
-            linear = proposals.affine.reshape(-1, 2, 2)
-            middles = index.xy[proposals.reference] + linear @ (scene.center - scene.intersections.xy[proposals.anchor])
-            near = self._is_near(middles, np.sqrt(np.abs(np.linalg.det(linear))))
-            counts["proposals"] += int(near.sum())
-            counts["on_roads"] += int(near[kept].sum())
-        scored = [entry for entry in events.of("scored") if self._is_there(entry.model.matrix)]
-        faults = [fault for fault, matrix in events.of("refused") if self._is_there(matrix / matrix[2, 2])]
-        faults += [entry.fault for entry in scored if entry.fault is not None]
-        survived = sum(self._is_there(matrix) for grown in events.of("grown") for matrix in grown)
-        counts |= {"survived": survived, "camera": len(faults), "verified": len(scored)}
-        return counts, faults, max((entry.log10_odds for entry in scored), default=-math.inf)
-
-    def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:
-        """Return which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
-        limit = np.maximum(_AT_LEAST_M, _ROUGHLY * scales * self.estimator.scene.half_size)
-        return np.asarray(np.hypot(*(xy - self.xy).T) <= limit)
-
-    def _is_there(self, matrix: FloatArray) -> bool:
-        """Return whether a homography puts the middle of the frame near the truth."""
-        scene = self.estimator.scene
-        scale = np.array([sampling(matrix, scene.size)])
-        return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
-
-    def story(
-        self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: float
-    ) -> TruthStory:
-        """Describe the stage that lost it."""
-        estimator = self.estimator
-        reach_m = estimator.scene.half_size * min(estimator.options.camera.gsd_m[1], _LARGE_PIXEL_M)
-        lost_at: str | None
-        if np.hypot(*(estimator.index.xy - self.xy).T).min() > 2.0 * reach_m:
-            lost_at, how = "map", "lies off the map that was searched"
-        elif counts.get("verified") and math.isfinite(best):
-            lost_at, how = self._weighed(best, location, needed)
-        else:
-            last = next((stage for stage in _LOST if counts.get(stage)), "")
-            lost_at, how = _LOST[last]
-            if last == "camera":
-                how += ": " + ", ".join(fault.value for fault, _ in Counter(faults).most_common())
-        return TruthStory(*self.lonlat, lost_at, f"the true place {how}", counts, _finite(best))
-
-    def _weighed(self, best: float, location: Location, needed: float) -> tuple[str | None, str]:
-        """Describe the fate of the truth after it was compared with the map."""
-        score, located = f"reached log10 odds {best:.1f}", False
-        if location.located and location.center is not None:
-            center = np.array([[location.center.lon, location.center.lat]])
-            xy = from_lonlat(self.estimator.index.plane, center)
-            located = bool(self._is_near(xy, np.array([location.gsd_m or 1.0]))[0])
-        if best < needed and not located:
-            return "odds", f"{score}, {needed:g} are needed"
-        if not located:
-            return "margin", f"{score}, but another place as much, or it was met too late"
-        if best < needed:
-            return None, f"{score}, but leads any other place where these streets repeat, and was located"
-        return None, f"{score} and was located"

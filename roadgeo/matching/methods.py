@@ -23,7 +23,8 @@ from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs, well_fitted
+from roadgeo.matching.pairs import PairIndex, build_pair_index, well_fitted
+from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.picture import Picture
 from roadgeo.matching.rivals import Rivals, Standing
@@ -385,17 +386,17 @@ def _search_pairs_in_turn(
     work_s, time_s = min(pair.work_limit_s, options.search.work_limit_s), min(pair.time_limit_s, time_s)
     for n_left in range(len(indexes), 0, -1):
         share = replace(pair, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
-        one = _search_pairs(query, indexes[-n_left], pair, share)
+        one = _search_pairs(query, indexes[-n_left], share)
         work_s, time_s = max(work_s - one.stats.work_ms / 1000, 0.0), max(time_s - one.match_s, 0.0)
         found.append(one)
     return found
 
 
-def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, share: PairOptions) -> Found:
-    """Run the paper's method within a share of its limits; its places have no scores."""
+def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> Found:
+    """Run the paper's method; its places have no scores."""
     scene = query.scene
-    table = _pair_index(index, options)
-    match = match_pairs(scene.intersections, table, scene.corners, share)
+    table = _pair_index(index, options.d_max_m)
+    match = match_pairs(scene.intersections, table, scene.corners, options)
     found = Found(
         index,
         stopped=match.stopped,
@@ -416,9 +417,9 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, sha
 
 
 @lru_cache(maxsize=4)
-def _pair_index(index: ReferenceIndex, options: PairOptions) -> PairIndex:
+def _pair_index(index: ReferenceIndex, d_max_m: float) -> PairIndex:
     """Build the paper's tables for a reference: too large to store with it, kept for a batch."""
     n = len(index)
     rays = unpack_branches(index.branches)
     found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
-    return build_pair_index(found.only(np.flatnonzero(well_fitted(index))), options)
+    return build_pair_index(found.only(np.flatnonzero(well_fitted(index))), d_max_m)

@@ -10,16 +10,8 @@ from naive import paper as naive
 from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import paper
-from roadgeo.matching.paper import (
-    PairIndex,
-    PairOptions,
-    build_pair_index,
-    cross_ratios,
-    fit_pencils,
-    match_pairs,
-    query_draws,
-    reference_draws,
-)
+from roadgeo.matching.pairs import PairIndex, build_pair_index, cross_ratios
+from roadgeo.matching.paper import PairOptions, fit_pencils, match_pairs, query_draws, reference_draws
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 
 FRAME = np.array([[0, 0], [1000, 0], [1000, -1000], [0, -1000]], float)
@@ -152,7 +144,7 @@ def crossing(x, y, *tangents_deg):
     ],
 )
 def test_tuples_pass_equations_7_and_8(second, options, expected):
-    index = build_pair_index(intersections(*zip(crossing(0, 0, 0, 90), second, strict=True)), options)
+    index = build_pair_index(intersections(*zip(crossing(0, 0, 0, 90), second, strict=True)), options.d_max_m)
     assert len(index) == expected
 
 

@@ -5,9 +5,9 @@ import pytest
 from shapely import LineString
 from worlds.scenes import PLANE
 
-from roadgeo.matching import paper
+from roadgeo.matching import pairs
 from roadgeo.matching.index import build_index
-from roadgeo.matching.paper import well_fitted
+from roadgeo.matching.pairs import well_fitted
 from roadgeo.roads.network import build_network
 
 
@@ -30,5 +30,5 @@ def test_bent_branches_are_discarded_and_straight_ones_kept(index):
 
 
 def test_branches_too_short_to_fit_are_discarded(index, monkeypatch):
-    monkeypatch.setattr(paper, "_LENGTH_M", 3000.0)
+    monkeypatch.setattr(pairs, "_LENGTH_M", 3000.0)
     assert not well_fitted(index).any()

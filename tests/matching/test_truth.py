@@ -12,9 +12,9 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place
 from roadgeo.matching.events import Events
-from roadgeo.matching.explanation import _TruePlace, tell_truth
 from roadgeo.matching.index import build_index
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.truth import _TruePlace, tell_truth
 
 REFUSED = Location("q", "not_located", "")
 

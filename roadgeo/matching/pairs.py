@@ -1,0 +1,193 @@
+"""The paper's tuples: two intersections of a map with their tangents, hashed by type (section 3.3).
+
+At each end of a tuple every tangent has an angle r in (0, pi), counterclockwise from the connecting line; its cotangent
+falls as the angle grows, so "in one rotational sense, starting from the line" is "falling cotangents". Cross ratios of
+lines in that order are greater than 1, so that a relative error (eq. 6) makes sense; trees hold their logarithms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.errors import IndexFormatError
+from roadgeo.kernels.pairs import PairBuckets
+from roadgeo.kernels.roads import road_residuals
+from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket
+from roadgeo.matching.scene import MIN_COS
+from roadgeo.roads.intersections import Intersections
+
+__all__ = [
+    "D_MAX_M",
+    "PairIndex",
+    "build_pair_index",
+    "cotangents",
+    "cross_ratios",
+    "list_pairs",
+    "type_codes",
+    "type_keys",
+    "well_fitted",
+]
+
+#: A dense city of 15,000 intersections has some millions; each takes about 100 bytes while the tables are built.
+_MAX_TUPLES = 30_000_000
+#: Greatest distance between the two intersections of a tuple, metres (eq. 8).
+D_MAX_M = 1000.0
+#: Least angle between a tangent and the connecting line, degrees (eq. 7).
+_LEAST_ANGLE_DEG = 15.0
+#: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
+#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`) and are sampled every `_STEP_M`. Roads
+#: further off than `_REACH_M`, or turned from the branch by more, are other roads.
+_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M = 15.0, 0.5, 8.0, 3.0, 6.0
+
+
+class Tuples(NamedTuple):
+    """Tuples of one type: (P, 2) intersections, and a `scipy` tree of their D cross ratios, None where D = 0."""
+
+    pairs: IntArray
+    tree: Any
+
+
+@dataclass(frozen=True, eq=False)
+class PairIndex:
+    """Reference tuples hashed by type, with one search tree of cross ratios for each type.
+
+    Attributes
+    ----------
+    codes : (N,) int64
+        Types of the intersections, 16 N_B + N_q.
+    tuples : mapping of int to Tuples
+        Keys are 256 times the code of the first end plus the code of the second end; the first is never the greater.
+    """
+
+    reference: Intersections
+    codes: IntArray
+    tuples: Mapping[int, Tuples]
+    buckets: PairBuckets
+
+    def __len__(self) -> int:
+        """Return the number of all tuples."""
+        return sum(len(tuples.pairs) for tuples in self.tuples.values())
+
+
+def build_pair_index(intersections: Intersections, d_max_m: float = D_MAX_M) -> PairIndex:
+    """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
+
+    Their ends lie at most `d_max_m` metres from each other (eq. 8).
+
+    Raises
+    ------
+    IndexFormatError
+        More intersections lie close to each other than on any map.
+    """
+    from scipy.spatial import cKDTree
+
+    xy = intersections.xy
+    codes = type_codes(intersections)
+    pairs = list_pairs(intersections, np.arange(len(xy)), d_max_m)
+    keys = type_keys(codes, pairs)
+    order = np.argsort(keys, kind="stable")
+    tuples = {}
+    for of_type in np.split(pairs[order], np.flatnonzero(np.diff(keys[order])) + 1) if len(pairs) else []:
+        step = (xy[of_type[:, 1]] - xy[of_type[:, 0]]).T
+        ratios = [cross_ratios(cotangents(intersections, ends, *step)) for ends in of_type.T]
+        logs = np.log(np.concatenate(ratios, axis=1))
+        tree = cKDTree(logs, balanced_tree=False, compact_nodes=False) if logs.shape[1] else None
+        tuples[int(type_keys(codes, of_type[:1])[0])] = Tuples(of_type, tree)
+    grid, shape = neighbour_grid(xy, min_bucket=10.0) if len(xy) else ((0.0, 0.0, 1.0), (1, 1))
+    items, starts = sort_by_bucket(xy, grid, shape)
+    return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
+
+
+def list_pairs(found: Intersections, chosen: IntArray, d_max: float) -> IntArray:
+    """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
+
+    Raises
+    ------
+    IndexFormatError
+        They would fill the memory.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(found.xy[chosen])
+    if len(chosen) ** 2 > _MAX_TUPLES:
+        count = (int(tree.count_neighbors(tree, d_max)) - len(chosen)) // 2
+        if count > _MAX_TUPLES:
+            raise IndexFormatError(
+                f"the map has {count:,} pairs of intersections nearer than {d_max:g} m, expected at most"
+                f" {_MAX_TUPLES:,}; the paper's method does not fit it: use the usual one"
+            )
+    pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
+    dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
+    phi, least = np.arctan2(dy, dx), math.sin(math.radians(_LEAST_ANGLE_DEG))
+    passes = (dx != 0.0) | (dy != 0.0)
+    for ends in pairs.T:
+        passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
+        # NaN: no tangent
+        passes &= ~(np.abs(np.sin(found.tangents[ends] - phi[:, None])) <= least).any(axis=1)
+    pairs, codes = np.sort(pairs[passes], axis=1), type_codes(found)
+    swapped = codes[pairs[:, 0]] > codes[pairs[:, 1]]
+    pairs[swapped] = pairs[swapped, ::-1]
+    return np.asarray(pairs)
+
+
+def type_codes(intersections: Intersections) -> IntArray:
+    """Return the (N,) types of intersections, 16 N_B + N_q."""
+    return (16 * intersections.n_branches + intersections.n_tangents).astype(np.int64)
+
+
+def type_keys(codes: IntArray, pairs: IntArray) -> IntArray:
+    """Return the (P,) types of tuples (see `PairIndex.tuples`)."""
+    return np.asarray(256 * codes[pairs[:, 0]] + codes[pairs[:, 1]])
+
+
+def cotangents(found: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
+    """Return the (P, N_q) falling cotangents of the tangents of `ends` (P,), all with N_q, relative to the lines."""
+    tangents = found.tangents[ends, : int(found.n_tangents[ends[0]])].astype(float)
+    return np.asarray(-np.sort(-1.0 / np.tan(tangents - np.arctan2(dy, dx)[:, None]), axis=1))
+
+
+def cross_ratios(cot: FloatArray) -> FloatArray:
+    """Return (P, D) cross ratios (a, b; c, d) = sin(ac) sin(bd) / (sin(bc) sin(ad)) of fours of lines (eq. 4).
+
+    They are concurrent: the tangents and the connecting line, whose cotangent is infinite, so that two factors cancel.
+    """
+    by_line, others = _fours(cot.shape[1])
+    b, c, d = cot[:, by_line].transpose(2, 0, 1)
+    first = (b - d) / (b - c)
+    a, b, c, d = cot[:, others].transpose(2, 0, 1)
+    return np.concatenate((first, (a - c) * (b - d) / ((b - c) * (a - d))), axis=1)
+
+
+@cache
+def _fours(n: int) -> tuple[IntArray, IntArray]:
+    """Return threes of n tangents, which make fours with the connecting line, and fours of them."""
+    three, four = (np.array(list(combinations(range(n), k)), np.int64).reshape(-1, k) for k in (3, 4))
+    return three, four
+
+
+def well_fitted(index: ReferenceIndex) -> BoolArray:
+    """Return which intersections (N,) have only branches that are long and straight enough (section 4.2)."""
+    vectors = index.branches.astype(float) / 127.0
+    at, column = np.nonzero(vectors.any(axis=2))
+    ahead = vectors[at, column]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    steps = _SKIP_M + np.arange(0.0, _LENGTH_M + 1e-9, _STEP_M)
+    points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
+    along, out = np.repeat(ahead, len(steps), axis=0), np.empty((len(points), 3))
+    road_residuals(np.eye(3), points, along, np.full(len(points), _REACH_M), MIN_COS, index.road_buckets, out)
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
+    # Residuals of the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
+    basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
+    error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
+    good = np.ones(len(index), bool)
+    good[at[~(error <= _MAX_ERROR_M)]] = False
+    return good
