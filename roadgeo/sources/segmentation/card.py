@@ -47,7 +47,7 @@ class ModelCard:
     tile : (height, width)
         Size of its input, pixels.
     any_size : bool
-        Whether tiles may also be smaller, their sides multiples of `TILE_STEP`.
+        Whether tiles of other sizes do as well, their sides multiples of `TILE_STEP`.
     kind : str
         Type of the numbers that it takes, as NumPy calls it; "uint8": RGB as it is, neither shifted nor scaled.
     channels_last : bool

@@ -49,7 +49,7 @@ class Network:
 
     @property
     def any_size(self) -> bool:
-        """Whether tiles may be smaller than the card's, and all of each is visible."""
+        """Whether tiles of other sizes than the card's do as well, and all of each is visible."""
         return self.card.any_size and self.seen == self._size == self.card.tile
 
     @property
@@ -64,7 +64,7 @@ class Network:
         Parameters
         ----------
         tile : (H, W, 3) uint8
-            RGB, of the model's own size, or of a smaller one where it takes any.
+            RGB, of the model's own size, or of another where it takes any.
 
         Returns
         -------
