@@ -82,14 +82,12 @@ class Network:
     def _run(self, tile: AnyArray) -> Float32Array:
         """Return the model's output (C, h, w)."""
         card = self.card
-        channels = (3,) if card.channels_last else (3, 1, 1)
-        kind = np.uint8 if card.kind == "uint8" else np.float32
-        picture: AnyArray = np.array(tile if card.channels_last else np.moveaxis(tile, 2, 0), kind, order="C")
-        if kind == np.float32:  # in place, for a tile in floats takes 10 MB
-            mean, std = (np.array(values, np.float32).reshape(channels) for values in (card.mean, card.std))
-            picture /= std * np.float32(255)
-            picture -= mean / std
-        given = self._model.run(card.output, picture[None].astype(card.kind, copy=False))
+        values = tile
+        if card.kind != "uint8":
+            scale, shift = np.array(card.std, np.float32) * np.float32(255), np.array(card.mean, np.float32)
+            values = (tile / scale - shift / np.array(card.std, np.float32)).astype(np.float32)
+        picture = np.ascontiguousarray(values if card.channels_last else np.moveaxis(values, 2, 0), card.kind)
+        given = self._model.run(card.output, picture[None])
         output: Float32Array = np.asarray(given, np.float32)
         output = output[0] if output.shape[:-3] == (1,) else output
         output = np.moveaxis(output, 2, 0) if output.ndim == 3 and channels_come_last(output.shape) else output
