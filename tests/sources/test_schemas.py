@@ -107,12 +107,11 @@ def test_whom_to_name(columns, attribution):
         ({"railway": ["rail", None, "no"]}, None),
         ({"highway": [None, None, None], "waterway": ["river", None, None]}, []),
         (
-            {"highway": ["residential", "service", "pedestrian"], "area": [None, "no", "yes"]},
+            {"HIGHWAY": ["residential", "service", "pedestrian"], "AREA": [None, "no", "yes"]},
             ["residential", "service"],
         ),
         ({"tags": [{"highway": "residential"}, {"highway": "steps"}, {"barrier": "wall"}]}, ["residential", "steps"]),
         ({"class": [float("nan"), 3, True]}, None),
-        ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
         ({"name": ["residential", "b", "c"]}, None),
         ({"class": ["A", "B", "C"], "fclass": ["trunk", "trunk", "trunk"]}, ["trunk"] * 3),
         (
