@@ -267,12 +267,12 @@ def test_the_command_line_writes_reports(
     porto: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    porto.save("porto.gpkg")
+    reference = str(porto.index.path)
     for name in ("drone", "elsewhere"):
         (tmp_path / f"{name}.png").write_bytes(MASKS[name].path.read_bytes())
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "broken_report.html").touch()  # of an earlier run, when it was not broken
-    arguments = ["locate", "drone.png", "elsewhere.png", "broken.png", "-r", "porto.gpkg", "--report", "--jobs", "2"]
+    arguments = ["locate", "drone.png", "elsewhere.png", "broken.png", "-r", reference, "--report", "--jobs", "2"]
     assert main(arguments) == 1
     assert "roadgeo_report.html" in capsys.readouterr().err
     assert "✓ located" in (tmp_path / "drone_report.html").read_text(encoding="utf-8")
@@ -281,7 +281,7 @@ def test_the_command_line_writes_reports(
     assert "1 located, 1 not located, 1 failed" in page
     assert ATTRIBUTION in page
     assert "broken_report.html" not in page
-    assert main(["locate", "elsewhere.png", "-r", "porto.gpkg", "--quiet"]) == 3
+    assert main(["locate", "elsewhere.png", "-r", reference, "--quiet"]) == 3
     assert not (tmp_path / "elsewhere_report.html").exists()  # nothing that no longer holds is left
 
 
