@@ -53,7 +53,7 @@ COARSE = BuildOptions(simplify=SimplifyOptions().times(COARSENESS))
 class Reference:
     """A searchable road map: its index, and the network it was built from where that is at hand.
 
-    `digest` is that of its intersections, where it was opened from a file.
+    `digest` is its intersections' digest, where it was opened from a file.
     """
 
     index: ReferenceIndex

@@ -42,7 +42,7 @@ _WORKING_WIDTH_PX, _MAX_WORKING_PIXELS = 6.0, 64_000_000
 #: for a thousand pixels, 0.7 million where they are as large as can be. So it is where it falls into more pieces of
 #: road: time and memory are bounded.
 _MAX_CORNERS, _MAX_PIECES = 3_000_000, 300_000
-#: And where roads of the lines' length and width would cover more of the frame: those of a dense town cover 0.16.
+#: And where roads of the lines' length and width would cover more of the frame: a dense town's roads cover 0.16.
 _MAX_COVER = 1.0
 #: Road widths: gaps up to this are closed, threads up to this are cut.
 _CLOSING, _OPENING = 0.35, 0.3
