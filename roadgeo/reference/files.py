@@ -33,7 +33,7 @@ from roadgeo.reference.network_file import (
 )
 from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import replacing
+from roadgeo.storage.files import remove_leftovers, replacing
 
 __all__ = [
     "Freshness",
@@ -109,6 +109,7 @@ def write_reference(
     """
     paths = reference_paths(path)
     meta, arrays = parts
+    remove_leftovers(paths.index.parent)  # large ones: each time
     with replacing(paths.index) as index, replacing(paths.geopackage) as geopackage:  # left last first
         write_network(geopackage, network, say)
         write_index(index, meta, arrays, _about(network, meta))

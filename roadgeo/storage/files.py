@@ -24,7 +24,7 @@ try:
 except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["make_folder", "replacing", "sync_file", "write_bytes", "write_text", "writing"]
+__all__ = ["make_folder", "remove_leftovers", "replacing", "sync_file", "write_bytes", "write_text", "writing"]
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
@@ -172,7 +172,7 @@ def _make_folder(parent: Path) -> tuple[Path, BinaryIO]:
         lock.close()
 
 
-def _remove_leftovers(parent: Path) -> None:
+def remove_leftovers(parent: Path) -> None:
     """Remove staging folders of dead writers: their lock is free."""
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # in use, or being removed by somebody else
@@ -188,7 +188,7 @@ def _remove_leftovers(parent: Path) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-_remove_leftovers_once = lru_cache(maxsize=64)(_remove_leftovers)
+_remove_leftovers_once = lru_cache(maxsize=64)(remove_leftovers)
 
 
 def _follow_no_link(path: str, flags: int) -> int:
