@@ -193,12 +193,14 @@ def thin_lines(lines: Sequence[FloatArray], limit: int, tolerance: float = 0.0) 
     tolerance : float
         How far lines may be moved at first, in their units.
     """
-    kept = _straighten(lines, tolerance) if tolerance > 0 else list(lines)
+    kept = list(lines)
+    if tolerance > 0:
+        kept = [_straighten(line, tolerance) for line in kept]
     step = max(tolerance, 0.5)
     for _ in range(4):
         if sum(map(len, kept)) <= limit:
             return kept
-        kept = _straighten(kept, step)
+        kept = [_straighten(line, step) for line in kept]
         step *= 3
     lengths = [float(np.hypot(*(line[1:] - line[:-1]).T).sum()) for line in kept]
     longest = np.argsort(-np.array(lengths), kind="stable")
@@ -258,12 +260,17 @@ def encode_picture(image: AnyArray, limit: int, *, lossless: bool = False) -> st
     return f"data:image/webp;base64,{base64.b64encode(encoded).decode()}"
 
 
-def _straighten(lines: Sequence[FloatArray], tolerance: float) -> list[FloatArray]:
-    """Leave out vertices that lie no farther from what is left (Douglas and Peucker)."""
-    import shapely
-
-    shapes = shapely.simplify([shapely.linestrings(line) for line in lines], tolerance, preserve_topology=False)
-    return [shapely.get_coordinates(shape) for shape in shapes]
+def _straighten(line: FloatArray, tolerance: float) -> FloatArray:
+    if len(line) < 3:
+        return line
+    if (line[0] == line[-1]).all():  # Douglas and Peucker start from a line between two different ends
+        k = int(np.argmax(np.hypot(*(line - line[0]).T)))
+        if k == 0:
+            return line[:2]
+        return np.concatenate([_straighten(line[: k + 1], tolerance), _straighten(line[k:], tolerance)[1:]])
+    origin = line[0]  # 32-bit numbers are fine near it
+    kept = cv2.approxPolyDP((line - origin).astype(np.float32), tolerance, False)[:, 0]
+    return np.asarray(kept + origin, np.float64)
 
 
 def _path(d: str, name: str = "") -> str:
