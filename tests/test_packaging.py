@@ -109,7 +109,7 @@ def test_an_onboard_computer_locates_and_names_what_is_missing(porto: Path, tmp_
         assert done.returncode == 0, done.stderr
     for package, arguments in (
         ("shapely", ["index", "--roads", ROADS, "--out", "a.gpkg"]),
-        ("uvicorn", ["serve", "-r", porto]),
+        ("starlette", ["serve", "-r", porto]),
     ):
         done = run(*arguments)
         assert done.returncode == 1
