@@ -174,9 +174,9 @@ class Rivals:
             if standing.rival is None or not standing.is_beaten:
                 break
             best = self._take(estimator, standing.rival, ranked)
-        if estimator.anywhere is None:
+        if estimator.anywhere is None or standing.is_beaten:
             return standing
-        free = self._seen(estimator.anywhere, standing.model, [standing.model])  # see `_compare`
+        free = self._seen(estimator.anywhere, standing.model, ranked)  # see `_compare`
         return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
 
     def _seen(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
