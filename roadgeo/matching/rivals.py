@@ -225,7 +225,7 @@ class Rivals:
         standing, anywhere = self._compare_allowed(estimator, best, ranked), estimator.anywhere
         if anywhere is None or standing.is_beaten or standing.log10_lead >= _CERTAIN:
             return standing
-        free = self._compare_allowed(anywhere, best, [best])
+        free = self._compare_allowed(anywhere, best, ranked)
         return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
 
     def _compare_allowed(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
