@@ -15,6 +15,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.evidence import Evidence, agreement, match_intersections
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.picture import Picture
 from roadgeo.matching.refinement import Refined, RefineOptions, points_on_map, refine, refine_between
 from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.shifts import APART_M, LocalSearchOptions, move_about, search_nearby
@@ -33,6 +34,8 @@ _MIN_CHI2 = 18.5
 _MIN_ROADS_M = 300.0
 #: A refinement that moves the corners by more than this, metres, has diverged.
 _MAX_DRIFT_M = 40.0
+#: Number of shifts with which a soft picture is compared.
+_N_SHIFTS = 8
 #: Half the distance between the lines of a dual carriageway, metres, up to 1.8 times as much.
 _TWIN_M = 10.0
 #: Prior standard deviation of the perspective that is left: georeferenced images are rectified.
@@ -121,6 +124,7 @@ class _Judge:
         self.gsd = sampling(start, scene.size)
         self.corners = Homography(start)(scene.corners)
         self.evidence = Evidence(scene, index, self.gsd)
+        self.picture = Picture(scene, index, self.gsd) if scene.probability is not None else None
         tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
         self.refine_options = RefineOptions() if tilted else RefineOptions(perspective_sigma=_PERSPECTIVE_SIGMA)
 
@@ -158,7 +162,29 @@ class _Judge:
         if refined is not None and n_points is None:
             refined, _ = refine_between(refined, scene, self.index, matched, self.refine_options)
             matrix = refined.matrix
-        return _Place(matrix, self.evidence.weigh(matrix), matched, refined)
+        return _Place(matrix, self.weigh(matrix), matched, refined)
+
+    def weigh(self, matrix: FloatArray) -> float:
+        """Return log10 L of a place: by a soft picture, or by the roads of a drawn mask."""
+        return (self.picture or self.evidence).weigh(matrix)
+
+    def lead(self, best: _Place, places: Sequence[_Place]) -> tuple[float, _Place | None]:
+        """Return the log10 lead of a place over its strongest rival, and the rival.
+
+        A soft picture is compared with all shifts as well, for it shows more than the roads that were traced in it.
+        """
+        rivals = [place for place in places if self.gap(place.matrix, best.matrix) >= APART_M]
+        if self.picture is None:
+            compare = self.evidence.compared_with(best.matrix)
+            leads = [compare(rival.matrix)[1] for rival in rivals]
+            return min(zip(leads, rivals, strict=True), key=lambda pair: pair[0], default=(0.0, None))
+        peaks = self.picture.correlate(best.matrix, self.options.search.reach_m, (0.0,), _N_SHIFTS, APART_M)
+        for peak in peaks:
+            if self.gap(peak.matrix, best.matrix) >= APART_M:
+                place = self.picture.settle(peak)
+                rivals.append(_Place(place.matrix, place.worth, best.matched, None))
+        hardest = max(rivals, key=lambda rival: rival.worth, default=None)
+        return best.worth - max(0.0 if hardest is None else hardest.worth, 0.0), hardest
 
     def without_twins(self, matrix: FloatArray) -> Scene:
         """Return the scene without road points that have parallel roads of the map on both sides.
@@ -198,10 +224,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     # The best place against its strongest rival.
     options = judge.options
     best = judge.refine(places[0].matrix, None)
-    rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= APART_M]
-    compare = judge.evidence.compared_with(best.matrix)
-    leads = [compare(rival.matrix)[1] for rival in rivals]
-    lead, hardest = min(zip(leads, rivals, strict=True), key=lambda pair: pair[0], default=(0.0, None))
+    lead, hardest = judge.lead(best, places[1:])
     if best.refined is None or hardest is None:
         return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")
     found = judge.displacement(best)

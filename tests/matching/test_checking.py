@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from worlds.motorways import motorways
-from worlds.scenes import Sight, camera, look, scene_of
+from worlds.scenes import Sight, camera, look, scene_of, soft
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import checking
@@ -13,13 +13,14 @@ from roadgeo.matching.shifts import LocalSearchOptions, Shift, move_about, searc
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
 
 
-@pytest.fixture(scope="module")
-def sights(town):
-    """(truth, scene) of three frames without tilt."""
+@pytest.fixture(scope="module", params=["drawn", "soft"])
+def sights(town, request):
+    """(truth, scene) of three frames without tilt, as masks and as pictures of probabilities."""
     found = []
     for seed, heading in ((1, 10.0), (2, 200.0), (3, 300.0)):
         truth = camera((1700.0 + 200 * seed, 2000.0), (900, 700), 1.0, heading_deg=heading)
-        found.append((truth, scene_of(look(town[0], truth, (900, 700), SIGHT, seed), (900, 700))))
+        scene = scene_of(look(town[0], truth, (900, 700), SIGHT, seed), (900, 700))
+        found.append((truth, soft(scene, seed=seed) if request.param == "soft" else scene))
     return found
 
 

@@ -2,11 +2,10 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
-from worlds.scenes import Sight, camera, look, scene_of
+from worlds.scenes import Sight, camera, look, scene_of, soft
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import picture as pictures
@@ -20,15 +19,6 @@ TRUTH = camera((2000.0, 1900.0), SIZE, 1.0, heading_deg=15.0)
 @pytest.fixture(scope="module")
 def scene(town):
     return scene_of(look(town[0], TRUTH, SIZE, Sight(1.0, missing=0.1, false=0.05)), SIZE)
-
-
-def soft(scene, strength=1.0, seed=0):
-    """The scene with a picture of probabilities: blurred, noisy, at most about as sure as `strength`."""
-    away_m = scene.field * scene.field_scale
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0.0, 1.0, away_m.shape).astype(np.float32), (0, 0), 3)
-    odds = strength * (4.0 - 0.5 * away_m + 4.0 * noise)
-    probability = np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -5.0, 5.0))), np.float32)
-    return replace(scene, probability=probability)
 
 
 def naive_weigh(picture, matrix):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import shapely
 from scipy.spatial import Delaunay
@@ -13,7 +14,7 @@ from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
 from worlds.drawn import camera, mapped
 
-__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
+__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of", "soft"]
 
 PLANE = LocalPlane("EPSG:32619", (330000.0, 4690000.0))
 
@@ -149,3 +150,12 @@ def sight_of(network, seed, tilt=0.0, sight=None, gsd=1.0):
     center = tuple(rng.uniform(1300, 2700, 2))
     truth = camera(center, (1000, 1000), gsd, tilt, rng.uniform(0, 360), rng.uniform(0, 360))
     return truth, scene_of(look(network, truth, sight=sight, seed=seed), px_per_m=1 / gsd)
+
+
+def soft(scene, strength=1.0, seed=0):
+    """The scene with a picture of probabilities: blurred, noisy, at most about as sure as `strength`."""
+    away_m = scene.field * scene.field_scale
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0.0, 1.0, away_m.shape).astype(np.float32), (0, 0), 3)
+    odds = strength * (4.0 - 0.5 * away_m + 4.0 * noise)
+    probability = np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -5.0, 5.0))), np.float32)
+    return replace(scene, probability=probability)
