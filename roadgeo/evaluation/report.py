@@ -15,8 +15,8 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import Layer, Ring
 from roadgeo.outputs.drawing.views import Window, map_layer
 from roadgeo.outputs.names import table_cell, table_text
-from roadgeo.outputs.report.page import footer, render_page, section
-from roadgeo.outputs.report.viewer import draw_viewer, window_data
+from roadgeo.outputs.report.page import name_owners, render_page, section, table
+from roadgeo.outputs.report.viewer import draw_viewer
 
 __all__ = ["TITLES", "masks_to_csv", "render_report", "summary_table", "verdicts"]
 
@@ -31,8 +31,8 @@ TITLES = {
 _NOTE = "In brackets: 95 % confidence. Metres, ms: median/95 %."
 _OUTCOMES = ("right", "wrong", "ambiguous", "not_located")
 
-#: Masks that are named on the page, vertices of the map's roads on it, and the width it is first drawn for.
-_MOST_LOST, _VERTICES, _VIEW_PX, _MARGIN = 200, 80_000, 900, 0.05
+#: Masks that are named on the page, vertices of the map's roads on it, and how much of the map lies around the masks.
+_MOST_LOST, _VERTICES, _MARGIN = 200, 80_000, 0.05
 
 
 # --- words and tables -------------------------------------------------------------------------------------------------
@@ -127,18 +127,14 @@ def render_report(
         The map, or its parts that the masks lie on, to draw its roads.
     """
     settings = ", ".join(f"{name} {_text(value)}" for name, value in evaluation.settings.items())
-    header = f"<h1>{html.escape(title)}</h1><p>{html.escape(settings)}</p>"
     parts = ["".join(f"<p>{html.escape(line)}</p>" for line in verdicts(evaluation))]
     for by, groups in evaluation.breakdowns.items():
         parts.append(
             section(TITLES[by], _table(*summary_table([*groups, evaluation.total] if by == "kind" else groups)))
         )
     parts.append(section("Masks that were lost", _lost(evaluation.scores)))
-    owed = dict.fromkeys(str(index.meta.get("attribution") or "") for index in indexes)
-    attribution = "; ".join(filter(None, owed))
-    parts.append(footer(attribution))
-    view = _draw_map(evaluation.scores, truths, indexes, attribution)
-    return render_page(title, header, f"<main>{view}<aside>{''.join(parts)}</aside></main>")
+    credit = name_owners(indexes)
+    return render_page(title, settings, _draw_map(evaluation.scores, truths, indexes, credit), parts, credit)
 
 
 def _text(value: object) -> str:
@@ -150,9 +146,7 @@ def _text(value: object) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in heads)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return table(heads, (map(html.escape, row) for row in rows))
 
 
 def _lost(scores: Sequence[Score]) -> str:
@@ -186,5 +180,4 @@ def _draw_map(scores: Sequence[Score], truths: Sequence[Truth], indexes: Sequenc
             if _outcome(entry) == outcome
         ]
         layers.append(Layer(outcome, name, marks))
-    data = window_data(window, _VIEW_PX)
-    return draw_viewer("Where the masks lie", window.box, layers, data, scale=True, credit=credit)
+    return draw_viewer("Where the masks lie", window, layers, credit)

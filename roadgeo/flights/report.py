@@ -18,15 +18,15 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.drawing.layers import Layer, Lines, Ring
 from roadgeo.outputs.drawing.svg import encode_picture, ring_data
 from roadgeo.outputs.drawing.views import Window, map_layer, mask_picture
-from roadgeo.outputs.report.page import footer, render_page, section
-from roadgeo.outputs.report.viewer import draw_viewer, window_data
+from roadgeo.outputs.report.page import name_owners, render_page, section
+from roadgeo.outputs.report.viewer import draw_viewer
 from roadgeo.outputs.wording import write_distance
 from roadgeo.reference.reference import Reference
 
 __all__ = ["Thumbnails", "render_flight"]
 
-#: How much of the map lies around the flight, the vertices its roads may have, and the width it is first drawn for.
-_MARGIN, _VERTICES, _VIEW_PX = 0.12, 40_000, 900
+#: How much of the map lies around the flight, and the vertices that its roads may have.
+_MARGIN, _VERTICES = 0.12, 40_000
 _THUMBNAIL_PX, _THUMBNAIL_BYTES, _MOST_THUMBNAILS = 220, 4000, 400
 _SIGNS = {"located": "◎", "tracked": "✓", "predicted": "≈", "lost": "✕"}
 _COLORS = {"located": "good", "tracked": "frame", "predicted": "fair", "lost": "bad"}
@@ -92,11 +92,11 @@ def render_flight(
     """
     counts = Counter(row.status for row in rows)
     states = ", ".join(f"{counts[status]} {status}" for status in _SIGNS if counts[status])
-    header = f"<h1>{html.escape(title)}</h1><p>{len(rows)} frames: {states}</p>"
+    text = f"{len(rows)} frames: {states}"
     reference = _usual_map(tracked)
     if reference is None:
         why = html.escape(rows[-1].reason if rows else "no frames")
-        return render_page(title, header, f"<main><aside><p>The flight was not located: {why}</p></aside></main>")
+        return render_page(title, text, "", [f"<p>The flight was not located: {why}</p>"])
     # Footprints in metres from the corner of the map that is shown.
     maps = [frame.reference for frame in tracked]
     there = [k for k, known in enumerate(maps) if known is not None and known.name == reference.name]
@@ -109,15 +109,11 @@ def render_flight(
         layers.append(Layer(status, status, marks))
     layers.append(Layer("way", "way", [Lines([np.array([ring.mean(axis=0) for ring in rings.values()])])]))
     layers.append(Layer("now", "", [Ring(next(iter(rings.values())))]))
-    attribution = str(reference.index.meta.get("attribution") or "")
-    data = window_data(window, _VIEW_PX)
-    view = draw_viewer("The flight on the map", window.box, layers, data, scale=True, credit=attribution)
+    credit = name_owners([reference.index])
+    view = draw_viewer("The flight on the map", window, layers, credit)
     values = _values(rows, rings, pictures or {})
-    body = (
-        f"<main>{view}<aside>{_player(rows)}{section('Frame', _card())}{footer(attribution)}</aside></main>"
-        f'<script type="application/json" id="frames">{values}</script><script>{_SCRIPT}</script>'
-    )
-    return render_page(title, header, body)
+    script = f'<script type="application/json" id="frames">{values}</script><script>{_SCRIPT}</script>'
+    return render_page(title, text, view, [_player(rows), section("Frame", _card()), script], credit)
 
 
 def _usual_map(tracked: Sequence[Tracked]) -> Reference | None:

@@ -18,8 +18,8 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.drawing.layers import Layer, Ring
 from roadgeo.outputs.drawing.views import whole_map
-from roadgeo.outputs.report.page import STATUS, footer, render_page, section
-from roadgeo.outputs.report.viewer import draw_viewer, window_data
+from roadgeo.outputs.report.page import STATUS, name_owners, render_page, section
+from roadgeo.outputs.report.viewer import draw_viewer
 from roadgeo.outputs.wording import format_lonlat, write_sigma
 from roadgeo.storage.files import write_text
 
@@ -28,7 +28,8 @@ __all__ = ["Entry", "render_batch", "write_batch"]
 #: More masks are only counted: the page stays below 3 MB.
 _MAX_LISTED = 3000
 
-_OVERVIEW_BYTES, _VIEW_PX = 200_000, 900
+#: Size of a map, and its width: twice what it is first drawn for.
+_OVERVIEW_BYTES, _OVERVIEW_PX = 200_000, 1800
 
 
 @dataclass(frozen=True)
@@ -92,15 +93,8 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     shared = Counter(entry.path.name for entry in shown)
     items = "".join(_item(entry, shared[entry.path.name] > 1) for entry in shown)
     listed = f'<ol class="list">{items}</ol>{note if left_out else ""}'
-    named = dict.fromkeys(_credit(index) for index, _ in maps)
-    parts = [section("Masks", listed), *others, footer("; ".join(filter(None, named)))]
-    title = counted(len(entries), "image")
-    header = f"<h1>{title}</h1><p>{states}</p>"
-    return render_page(title, header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
-
-
-def _credit(index: ReferenceIndex) -> str:
-    return str(index.meta.get("attribution") or "")
+    credit = name_owners(index for index, _ in maps)
+    return render_page(counted(len(entries), "image"), states, views[0], [section("Masks", listed), *others], credit)
 
 
 def _has_place(entry: Entry) -> bool:
@@ -109,7 +103,7 @@ def _has_place(entry: Entry) -> bool:
 
 def _draw_map(index: ReferenceIndex, entries: Sequence[Entry]) -> str:
     """Draw a whole map with the footprints that lie on it, each a link."""
-    picture, window = whole_map(index, _OVERVIEW_BYTES, 2 * _VIEW_PX)
+    picture, window = whole_map(index, _OVERVIEW_BYTES, _OVERVIEW_PX)
     layers = [picture]
     for status in ("ambiguous", "chosen", "located"):
         there = [entry for entry in entries if entry.status == status and _has_place(entry)]
@@ -118,8 +112,7 @@ def _draw_map(index: ReferenceIndex, entries: Sequence[Entry]) -> str:
             for entry in there
         ]
         layers.append(Layer(status, STATUS[status][2:], rings))
-    text, data = f"The footprints on the map {index.name}", window_data(window, _VIEW_PX)
-    return draw_viewer(text, window.box, layers, data, scale=True, credit=_credit(index))
+    return draw_viewer(f"The footprints on the map {index.name}", window, layers, name_owners([index]))
 
 
 def _item(entry: Entry, with_folder: bool) -> str:

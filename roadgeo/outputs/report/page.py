@@ -7,9 +7,8 @@ are missing.
 from __future__ import annotations
 
 import html
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +31,13 @@ from roadgeo.outputs.drawing.views import (
     whole_map,
 )
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
-from roadgeo.outputs.report.viewer import draw_viewer, frame_data, window_data
+from roadgeo.outputs.report.viewer import draw_viewer
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat, write_distance, write_lead, write_sigma
 
-__all__ = ["STATUS", "footer", "render_page", "render_report", "section", "table", "write_report"]
+__all__ = [
+    "STATUS", "label_values", "name_owners", "render_page", "render_report", "section", "table", "write_report",
+]  # fmt: skip
 
 #: How each status is shown: by a sign and a word, not by colour alone.
 STATUS = {
@@ -56,8 +57,8 @@ _TAKING = "If you know one of the places to be right, the same command with --ta
 #: Below this number of intersections a report recommends a larger frame.
 _FEW = 12
 
-#: Widths in pixels that views are scaled for until the page's script knows better.
-_PLACE_PX, _MASK_PX, _OVERVIEW_PX = 900, 400, 380
+#: Widths in pixels that smaller views are scaled for until the page's script knows better.
+_MASK_PX, _OVERVIEW_PX = 400, 380
 
 #: Screen pixels that a large residual's arrow (the 90th percentile) and a corner's circle get at most.
 _ARROW_PX, _CIRCLE_PX = 26.0, 60.0
@@ -82,22 +83,33 @@ def render_report(subject: Subject) -> str:
         _explain(subject),
         section(f"In the {subject.kind}", "".join(views[1:])),
         section("Where on the map", _draw_overview(subject)),
-        section("Numbers", table(_numbers(subject))),
+        section("Numbers", label_values(_numbers(subject))),
         section("Corners", _corners(subject)) if subject.has_place else "",
         section("Matched intersections", _matches(subject)),
-        f"<details><summary>Everything else</summary>{table(_details(subject))}</details>",
-        footer(subject.attribution),
+        f"<details><summary>Everything else</summary>{label_values(_details(subject))}</details>",
     ]
     name = bare_name(location.query) or "mask"
-    header = (
-        f'<h1>{html.escape(name)}</h1><span class="status {location.status}">{STATUS[location.status]}</span>'
-        f"<p>{html.escape(_sentence(without_folders(location.reason, location.query)))}</p>"
-    )
-    return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
+    reason = _sentence(without_folders(location.reason, location.query))
+    status = (location.status, STATUS[location.status])
+    return render_page(name, reason, views[0], parts, subject.attribution, status)
 
 
-def render_page(title: str, header: str, body: str) -> str:
-    """Put HTML into a page with the style and the behaviour of all reports; it may load nothing from anywhere."""
+def render_page(
+    title: str, text: str, view: str, parts: Iterable[str], attribution: str = "", status: tuple[str, str] | None = None
+) -> str:
+    """Put a view and what stands beside it (HTML) into a page of its own, which may load nothing from anywhere.
+
+    Parameters
+    ----------
+    title, text : str
+        Heading, and a sentence below it.
+    attribution : str
+        Whom the map's licence asks to name.
+    status : (str, str), optional
+        Name of a status, by which it is coloured, and how it is shown beside the heading.
+    """
+    badge = "" if status is None else f'<span class="status {status[0]}">{status[1]}</span>'
+    credit = f"Map: {html.escape(attribution)}. " if attribution else ""
     style, script = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     allowed = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     return f"""<!DOCTYPE html>
@@ -114,8 +126,9 @@ def render_page(title: str, header: str, body: str) -> str:
 <noscript><style>.buttons, .legend input {{ display: none }}</style></noscript>
 </head>
 <body>
-<header>{header}</header>
-{body}
+<header><h1>{html.escape(title)}</h1>{badge}<p>{html.escape(text)}</p></header>
+<main>{view}<aside>{"".join(parts)}
+<footer>{credit}Made by roadgeo {__version__}. This file needs no network.</footer></aside></main>
 <script>
 {script}</script>
 </body>
@@ -123,21 +136,29 @@ def render_page(title: str, header: str, body: str) -> str:
 """
 
 
+def name_owners(indexes: Iterable[ReferenceIndex]) -> str:
+    """Name whom the licences of maps ask to name, each once."""
+    names = dict.fromkeys(str(index.meta.get("attribution") or "") for index in indexes)
+    return "; ".join(filter(None, names))
+
+
 def section(title: str, content: str) -> str:
     """Put a heading over HTML; nothing for nothing."""
     return f"<section><h2>{html.escape(title)}</h2>{content}</section>" if content else ""
 
 
-def footer(attribution: str) -> str:
-    """Name whom the map's licence asks to name, and the program."""
-    credit = f"Map: {html.escape(attribution)}. " if attribution else ""
-    return f"<footer>{credit}Made by roadgeo {__version__}. This file needs no network.</footer>"
-
-
-def table(rows: Sequence[tuple[str, str]]) -> str:
+def label_values(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of labels and values (HTML)."""
     body = "".join(f'<tr><th scope="row">{html.escape(label)}</th><td>{value}</td></tr>' for label, value in rows)
     return f'<table class="numbers">{body}</table>'
+
+
+def table(heads: Iterable[str], rows: Iterable[Iterable[str]], name: str = "") -> str:
+    """Return heads and cells (HTML) as a table that is scrolled."""
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    head = "".join(f'<th scope="col">{html.escape(text)}</th>' for text in heads)
+    whole = f'<table class="{name}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+    return f'<div class="scroll" tabindex="0">{whole}</div>'
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -148,21 +169,16 @@ def _draw_frame(subject: Subject) -> str:
     picture, *marks = frame_layers(subject)
     layers = [picture, *probability_layer(subject), *marks]
     text = f"The {subject.kind} {bare_name(subject.location.query)}, with the roads and intersections seen in it"
-    return draw_viewer(text, subject.box, layers, frame_data(subject.box, _MASK_PX))
+    return draw_viewer(text, subject.box, layers, width_px=_MASK_PX)
 
 
 def _draw_place(subject: Subject) -> str:
     """Draw the map around a footprint, and the footprint on it: an HTML figure."""
-    window = _window(subject)
-    arrows, per_px = _arrow_scale(subject.location), window.width / _PLACE_PX
-    data = window_data(window, _PLACE_PX) | {
-        "data-homography": json.dumps((window.matrix() @ subject.place.homography).tolist()),
-        "data-arrows": f"{arrows:.4g}",
-    }
-    data["style"] += f";--k:{max(1.0, arrows * per_px):.4g}"
-    location, layers = subject.location, place_layers(subject, window)
+    window, location = _window(subject), subject.location
     text = f"Map, north up: the footprint of {bare_name(location.query)} over the roads of {location.reference}"
-    return draw_viewer(text, window.box, layers, data, scale=True, enlarged=True, credit=subject.attribution)
+    homography = window.matrix() @ subject.place.homography
+    layers, arrows = place_layers(subject, window), _arrow_scale(location)
+    return draw_viewer(text, window, layers, subject.attribution, arrows=arrows, homography=homography)
 
 
 def _window(subject: Subject) -> Window:
@@ -344,19 +360,16 @@ def _matches(subject: Subject) -> str:
     pixels = plane_to_pixel(matches.query_xy)
     values = np.column_stack([pixels, matches.reference_xy, matches.residual_m]).tolist()
     rows = [
-        f'<tr><td><button type="button">{i}</button></td><td>{column:.1f}</td><td>{row:.1f}</td>'
-        f"<td>{x:.2f}</td><td>{y:.2f}</td><td>{residual:.2f}</td></tr>"
-        for i, (column, row, x, y, residual) in enumerate(values, 1)
+        (f'<button type="button">{i}</button>', f"{column:.1f}", f"{row:.1f}", *(f"{value:.2f}" for value in more))
+        for i, (column, row, *more) in enumerate(values, 1)
     ]
-    heads = "".join(f'<th scope="col">{name}</th>' for name in ("No.", "column", "row", "x", "y", "residual, m"))
     left_out = subject.location.n_matched - len(rows)
     note = f'<p class="faint">{left_out} more, with smaller residuals, are not shown.</p>' if left_out > 0 else ""
     return (
         '<p class="faint">Choose one here or in a picture to see it in both. Arrows go from the map to the mask.</p>'
         '<p class="chosen-match" role="status"></p>'
         f"<details><summary>All {len(rows)}, the largest residual first</summary>"
-        f'<div class="scroll" tabindex="0"><table class="matches"><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div></details>{note}"
+        f"{table(('No.', 'column', 'row', 'x', 'y', 'residual, m'), rows, 'matches')}</details>{note}"
     )
 
 

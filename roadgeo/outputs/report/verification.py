@@ -19,16 +19,21 @@ from roadgeo.outputs.drawing.svg import join_segments, thin_lines
 from roadgeo.outputs.drawing.views import touching
 from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.orthophoto import read_preview
-from roadgeo.outputs.report.page import footer, render_page, section, table
-from roadgeo.outputs.report.viewer import draw_viewer, frame_data
+from roadgeo.outputs.report.page import label_values, render_page, section
+from roadgeo.outputs.report.viewer import draw_viewer
 from roadgeo.storage.files import write_text
 
 __all__ = ["write_verification"]
 
 #: Side and bytes of the picture, and vertices of each of the two drawings of the map's roads.
 _PICTURE_PX, _PICTURE_BYTES, _MOST_VERTICES = 1400, 300_000, 40_000
-_STATUS = {"agrees": "located", "off": "ambiguous", "unknown": "not_located", "error": "error"}
-_SIGN = {"agrees": "✓ agrees", "off": "≠ off", "unknown": "? unknown", "error": "! failed"}
+#: How each verdict is coloured, and shown.
+_STATUS = {
+    "agrees": ("located", "✓ agrees"),
+    "off": ("ambiguous", "≠ off"),
+    "unknown": ("not_located", "? unknown"),
+    "error": ("error", "! failed"),
+}
 
 
 def write_verification(
@@ -62,13 +67,9 @@ def write_verification(
     name, verdict = bare_name(document["image"]), document["verdict"]
     view = "" if place is None else _draw(document["image"], name, place, corrected, index)
     rows = [(label, html.escape(value)) for label, value in _numbers(document) if value]
-    parts = section("Numbers", table(rows) if rows else "")
-    header = (
-        f'<h1>{html.escape(name)}</h1><span class="status {_STATUS[verdict]}">{_SIGN[verdict]}</span>'
-        f"<p>{html.escape(sentence)}</p>"
-    )
-    credit = footer(str(document.get("attribution") or ""))
-    write_text(path, render_page(name, header, f"<main>{view}<aside>{parts}{credit}</aside></main>"))
+    parts = [section("Numbers", label_values(rows) if rows else "")]
+    credit = str(document.get("attribution") or "")
+    write_text(path, render_page(name, sentence, view, parts, credit, _STATUS[verdict]))
 
 
 def _draw(
@@ -83,7 +84,7 @@ def _draw(
         layers.append(Layer("map-roads" if corrected else "query-roads", given, _roads_in(place, index)))
         if corrected is not None:
             layers.append(Layer("query-roads", "the map's roads, corrected", _roads_in(corrected, index)))
-    return draw_viewer(f"The image {name}, with the roads of the map", box, layers, frame_data(box, 900))
+    return draw_viewer(f"The image {name}, with the roads of the map", box, layers)
 
 
 def _roads_in(place: Georeference, index: ReferenceIndex) -> list[Lines]:

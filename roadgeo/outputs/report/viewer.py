@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Sequence
 
+from roadgeo._arrays import FloatArray
 from roadgeo.outputs.drawing.layers import Box, Layer
 from roadgeo.outputs.drawing.svg import draw_layer, draw_marks, draw_sign
 from roadgeo.outputs.drawing.views import Window
 
-__all__ = ["draw_viewer", "frame_data", "window_data"]
+__all__ = ["draw_viewer"]
 
 _BUTTONS = (
     '<div class="buttons"><button type="button" data-act="in" aria-label="Zoom in">+</button>'
@@ -24,13 +26,13 @@ _MARKS = (
 
 def draw_viewer(
     text: str,
-    box: Box,
+    shown: Box | Window,
     layers: Sequence[Layer],
-    data: dict[str, str],
-    *,
-    scale: bool = False,
-    enlarged: bool = False,
     credit: str = "",
+    *,
+    width_px: float = 900,
+    arrows: float = 0.0,
+    homography: FloatArray | None = None,
 ) -> str:
     """Draw layers that can be zoomed into, with a legend that switches those that have a label: an HTML figure.
 
@@ -38,17 +40,28 @@ def draw_viewer(
     ----------
     text : str
         Describes the view to those who cannot see it.
-    data : dict
-        Attributes of the SVG, for the page's script; see `frame_data`, `window_data`.
-    scale : bool
-        Show a scale bar: the units are metres.
-    enlarged : bool
-        Show the factor by which residuals and circles are enlarged.
+    shown : Box or Window
+        All of an image, in its pixels; or a part of the map, in metres, with a scale bar.
     credit : str
         Stands in a corner.
+    width_px : float
+        Width that it is drawn for until the page's script knows better.
+    arrows : float
+        Screen pixels for a metre of residuals and of corners' circles, which are enlarged by a factor that is shown.
+    homography : (3, 3), optional
+        From the pixels of the page's image to the frame of the window.
     """
-    notes = '<span>residuals, corners <span class="times">enlarged</span></span>' if enlarged else ""
-    notes += '<span class="scale"></span>' if scale else ""
+    box = shown.box if isinstance(shown, Window) else shown
+    unit, notes = max(box[2:]) / width_px, ""
+    data = {"style": f"--u:{unit:.4g};--k:{max(1.0, arrows * unit):.4g}", "data-frame": "mask"}
+    if isinstance(shown, Window):
+        data |= {"data-frame": "map", "data-west": f"{shown.west:.3f}", "data-north": f"{shown.north:.3f}"}
+        notes = '<span class="scale"></span>'
+    if homography is not None:
+        data["data-homography"] = json.dumps(homography.tolist())
+    if arrows:
+        data["data-arrows"] = f"{arrows:.4g}"
+        notes = f'<span>residuals, corners <span class="times">enlarged</span></span>{notes}'
     named = f'<span class="credit">{html.escape(credit)}</span>' if credit else ""
     pad = 0.02 * max(box[2:])
     view = f"{box[0] - pad:.1f} {box[1] - pad:.1f} {box[2] + 2 * pad:.1f} {box[3] + 2 * pad:.1f}"
@@ -68,18 +81,3 @@ def draw_viewer(
         f'{_BUTTONS}<div class="notes">{notes}<span class="position"></span></div>{named}</div>'
         f'<fieldset class="legend" aria-label="Layers">{legend}</fieldset></figure>'
     )
-
-
-def frame_data(box: Box, width_px: float) -> dict[str, str]:
-    """Return the attributes of a view of an image, drawn for a width in pixels until the page's script knows better."""
-    return {"data-frame": "mask", "style": f"--u:{max(box[2:]) / width_px:.4g}"}
-
-
-def window_data(window: Window, width_px: float) -> dict[str, str]:
-    """Return the attributes of a view of the map."""
-    return {
-        "data-frame": "map",
-        "data-west": f"{window.west:.3f}",
-        "data-north": f"{window.north:.3f}",
-        "style": f"--u:{window.width / width_px:.4g}",
-    }
