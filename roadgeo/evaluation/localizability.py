@@ -20,7 +20,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.geometry.warping import MapGrid
 from roadgeo.outputs.drawing.layers import Layer, Lines, Picture, rgb
-from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_scale_bar, write_text
+from roadgeo.outputs.drawing.raster import FAINT, Canvas, below, beside, blank, draw_scale_bar, framed, line
 from roadgeo.roads.network import RoadNetwork
 
 __all__ = [
@@ -284,15 +284,9 @@ def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: s
     classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
     canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])
     draw_scale_bar(canvas, 22)
-    top, bottom = 84, 36
-    height, width = canvas.image.shape[:2]
-    picture = blank(height + top + bottom, max(width, 700))
-    picture[top : top + height, :width] = canvas.image
-    write_text(picture, title, (10, 32), 24, INK, bold=True)
-    x = 10
+    legend = []
     for value, (_, alpha, label) in list(PALETTE.items())[1:]:
-        color = tuple(round((alpha * part + (255 - alpha) * 255) / 255) for part in colors[value][:3])
-        cv2.rectangle(picture, (x, 54), (x + 16, 70), color, -1)
-        x = write_text(picture, label, (x + 24, 69), 17, INK) + 28
-    write_text(picture, str(network.meta.get("attribution") or ""), (10, len(picture) - 11), 16, FAINT)
-    return picture
+        red, green, blue = (round((alpha * part + (255 - alpha) * 255) / 255) for part in colors[value][:3])
+        legend.append(beside(blank(22, 22, (red, green, blue)), line(label, 17), gap=8))
+    credit = line(str(network.meta.get("attribution") or ""), 16, FAINT)
+    return framed(below(line(title, 24, bold=True), beside(*legend, gap=28), canvas.image, credit, gap=8), 10)

@@ -6,11 +6,9 @@ import json
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
@@ -18,11 +16,22 @@ from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
-from roadgeo.matching.explanation import Explanation, Funnel, RejectedPlace, Story
+from roadgeo.matching.explanation import Explanation, RejectedPlace, Story
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.outputs.drawing.layers import Color, Dots, Layer, Lines, Ring, rgb
-from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_legend, write_png, write_text
+from roadgeo.outputs.drawing.raster import (
+    FAINT,
+    INK,
+    Canvas,
+    below,
+    beside,
+    blank,
+    draw_legend,
+    framed,
+    line,
+    write_png,
+)
 from roadgeo.outputs.drawing.views import Window, map_layer, mask_layer
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.subject import Subject
@@ -33,10 +42,10 @@ __all__ = ["draw_explanation", "write_explanation", "write_explanation_picture"]
 BAR: Color = (150, 178, 204)
 STARVED: Color = rgb("bad")
 
-_WIDTH, _MARGIN, _HEAD = 2000, 30, 96
-_MASK = 840  # side of the panel that shows the mask
+#: Width of the picture, room around it, and widths of the mask's column and of the column of places.
+_WIDTH, _MARGIN, _MASK = 2000, 30, 840
+_PLACES = _WIDTH - _MASK - 3 * _MARGIN
 _PLACE_VERTICES = 20_000  # of the map's roads in the picture of a place
-_CAPTION = 132  # height of the text below a place
 
 #: Names of the stages of `Funnel` in the picture.
 _STAGES = {
@@ -85,80 +94,62 @@ def draw_explanation(subject: Subject) -> AnyArray:
     explanation = _explained(subject)
     index, stories = subject.index_of(explanation.nearest.reference), explanation.stories
     story = next((each for each in stories if each.reference == index.name), stories[0])
-    left = np.vstack([_draw_seen(subject, explanation), _draw_funnel(story)])
-    right = np.vstack([_draw_places(story.places, explanation.scene, index), _draw_notes(story)])
-    height = max(len(left), len(right))
-    picture = blank(_HEAD + height + _MARGIN, _WIDTH)
-    picture[_HEAD : _HEAD + len(left), _MARGIN : _MARGIN + left.shape[1]] = left
-    picture[_HEAD : _HEAD + len(right), -right.shape[1] - _MARGIN : -_MARGIN] = right
     location = explanation.location
-    name = Path(location.query).name or "mask"
-    title = f"{name} on {story.reference}: {location.status.replace('_', ' ')}"
-    write_text(picture, title, (_MARGIN, 42), 30, INK, bold=True)
-    write_text(picture, textwrap.shorten(location.reason, 150, placeholder="…"), (_MARGIN, 78), 21, FAINT)
-    attribution = str(index.meta.get("attribution", ""))
-    write_text(picture, attribution, (_WIDTH - right.shape[1] - _MARGIN, len(picture) - 12), 14, FAINT)
-    return picture
+    title = f"{Path(location.query).name or 'mask'} on {story.reference}: {location.status.replace('_', ' ')}"
+    reason = textwrap.shorten(location.reason, 150, placeholder="…")
+    head = below(line(title, 30, bold=True), line(reason, 21, FAINT), width=_WIDTH - 2 * _MARGIN)
+    credit = line(str(index.meta.get("attribution", "")), 14, FAINT)
+    left = below(*_draw_seen(subject, explanation), *_draw_funnel(story), gap=6, width=_MASK)
+    places = _draw_places(story.places, explanation.scene, index)
+    right = below(*places, *_draw_notes(story), credit, gap=8, width=_PLACES)
+    return framed(below(head, beside(left, right, gap=_MARGIN), gap=10), _MARGIN)
 
 
 # --- the mask ---------------------------------------------------------------------------------------------------------
 
 
-def _draw_seen(subject: Subject, explanation: Explanation) -> AnyArray:
-    """Draw the mask, its traced roads and its intersections, and a line of numbers below."""
+def _draw_seen(subject: Subject, explanation: Explanation) -> list[AnyArray]:
+    """Draw the mask, its traced roads and its intersections, and a line of numbers."""
     scene = explanation.scene
-    roads = Lines([plane_to_pixel(line) for line in explanation.graph.polylines()])
+    roads = Lines([plane_to_pixel(road) for road in explanation.graph.polylines()])
     crossings = plane_to_pixel(scene.intersections.xy)
     canvas = Canvas.of(subject.box, _MASK, _MASK)
     canvas.draw([mask_layer(subject), Layer("query-roads", "", [roads]), Layer("matches", "", [Dots(crossings)])])
-    panel, image = blank(_MASK + 40, _MASK), canvas.image[:_MASK, :_MASK]
-    top, left = (_MASK - len(image)) // 2, (_MASK - image.shape[1]) // 2
-    panel[top : top + len(image), left : left + image.shape[1]] = image
     unseen_share = 1.0 - float(scene.observed.mean())
-    numbers = f"{subject.mask_size[0]} x {subject.mask_size[1]} px   ·   {counted(len(crossings), 'intersection')}"
-    numbers += f"   ·   {counted(scene.n_edges, 'road')}"
-    if unseen_share > 0.01:
-        numbers += f"   ·   {unseen_share:.0%} not observed"
-    write_text(panel, numbers, (0, _MASK + 28), 19, INK)
-    return panel
+    numbers = [f"{subject.mask_size[0]} x {subject.mask_size[1]} px", counted(len(crossings), "intersection")]
+    numbers += [counted(scene.n_edges, "road"), *([f"{unseen_share:.0%} not observed"] if unseen_share > 0.01 else [])]
+    return [canvas.image, line("   ·   ".join(numbers), 19)]
 
 
-def _draw_funnel(story: Story) -> AnyArray:
+def _draw_funnel(story: Story) -> list[AnyArray]:
     """Draw a bar for each stage; its length is the logarithm of the number of candidates left."""
-    stages = [field.name for field in fields(Funnel)]
-    panel = blank(40 + 29 * len(stages), _MASK)
-    write_text(panel, "How far the search got", (0, 24), 21, INK, bold=True)
-    most = max(max(getattr(story.funnel, stage) for stage in stages), 10)
-    for i, stage in enumerate(stages):
-        count = getattr(story.funnel, stage)
-        baseline = 60 + 29 * i
+    counts = {stage: int(getattr(story.funnel, stage)) for stage in _STAGES}
+    most = max(*counts.values(), 10)
+    rows = [line("How far the search got", 21, bold=True)]
+    for stage, count in counts.items():
         starved = stage == story.starved_at or (stage == "verified" and story.starved_at == "camera")
-        write_text(panel, _STAGES[stage], (0, baseline), 18, STARVED if starved else INK)
-        room = _MASK - 400
-        length = round(room * math.log10(1 + count) / math.log10(1 + most))
-        cv2.rectangle(panel, (290, baseline - 15), (290 + length, baseline + 3), STARVED if starved else BAR, -1)
-        write_text(panel, f"{count:,}", (300 + length, baseline), 18, INK)
-    return panel
+        label = below(line(_STAGES[stage], 18, STARVED if starved else INK), width=290)
+        bar = blank(len(label), 10 + round((_MASK - 400) * math.log10(1 + count) / math.log10(1 + most)))
+        bar[4:22, :-10] = STARVED if starved else BAR
+        rows.append(beside(label, bar, line(f"{count:,}", 18)))
+    return rows
 
 
 # --- the places -------------------------------------------------------------------------------------------------------
 
 
-def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: ReferenceIndex) -> AnyArray:
-    width = _WIDTH - _MASK - 3 * _MARGIN
+def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: ReferenceIndex) -> list[AnyArray]:
+    """Draw the best places, two or three in a row."""
     if not places:
-        panel = blank(160, width, rgb("paper"))
-        write_text(panel, "No place got as far as being compared with the map.", (_MARGIN, 90), 22, FAINT)
-        return panel
+        return [line("No place got as far as being compared with the map.", 22, FAINT)]
     columns = min(max(len(places), 2), 3)
-    side = (width - (columns - 1) * _MARGIN) // columns
-    rows = -(-len(places) // columns)
-    panel = blank(rows * (side + _CAPTION), width)
-    for i, place in enumerate(places):
-        top, left = i // columns * (side + _CAPTION), i % columns * (side + _MARGIN)
-        panel[top : top + side, left : left + side] = _draw_place(place, scene, index, side)
-        _caption(panel, (left, top + side), side, i + 1, place)
-    return panel
+    side = (_PLACES - (columns - 1) * _MARGIN) // columns
+    drawn = [
+        below(_draw_place(place, scene, index, side), *_caption(number, place, side), width=side)
+        for number, place in enumerate(places, 1)
+    ]
+    rows = [beside(*drawn[k : k + columns], gap=_MARGIN) for k in range(0, len(drawn), columns)]
+    return [below(*rows, blank(0, 0), gap=20)]
 
 
 def _draw_place(place: RejectedPlace, scene: Scene, index: ReferenceIndex, side: int) -> AnyArray:
@@ -186,33 +177,21 @@ def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray
     return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
-def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, place: RejectedPlace) -> None:
-    x, y = origin
+def _caption(number: int, place: RejectedPlace, side: int) -> list[AnyArray]:
     log10_odds = place.scored.log10_odds
     odds = f"score {round(log10_odds, 1) + 0.0:.1f}" if math.isfinite(log10_odds) else "no fit"
-    write_text(panel, f"{number}   {odds}", (x, y + 24), 19, INK, bold=True)
     where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.camera.gsd_m:.2f} m/px"
-    write_text(panel, where, (x, y + 48), 15, FAINT)
-    for i, line in enumerate(textwrap.wrap(place.why, side // 8)[:3]):
-        write_text(panel, line, (x, y + 70 + 19 * i), 15, INK)
+    why = [line(text, 15) for text in textwrap.wrap(place.why, side // 8)[:3]]
+    return [line(f"{number}   {odds}", 19, bold=True), line(where, 15, FAINT), *why]
 
 
 # --- notes ------------------------------------------------------------------------------------------------------------
 
 
-def _draw_notes(story: Story) -> AnyArray:
+def _draw_notes(story: Story) -> list[AnyArray]:
     """Write the stage that failed, and the meaning of the colours."""
-    width = _WIDTH - _MASK - 3 * _MARGIN
-    wrapped = partial(textwrap.wrap, width=width // 10, initial_indent="·  ", subsequent_indent="    ")
-    lines = [line for note in story.missing for line in wrapped(note)]
-    panel = blank(114 + 27 * len(lines), width)
-    y = 38
-    if lines:
-        write_text(panel, "What was missing", (0, y), 21, INK, bold=True)
-        y += 32
-    for line in lines:
-        write_text(panel, line, (0, y), 18, INK)
-        y += 27
+    wrapped = partial(textwrap.wrap, width=_PLACES // 10, initial_indent="·  ", subsequent_indent="    ")
+    lines = [line(text, 18) for note in story.missing for text in wrapped(note)]
     keys = [
         Layer("map-roads", "map", [Lines([])]),
         Layer("agreeing-roads", "mask, agrees", [Lines([])]),
@@ -220,5 +199,6 @@ def _draw_notes(story: Story) -> AnyArray:
         Layer("footprint", "frame, with its top", [Lines([])]),
         Layer("matches", "intersection", [Dots(np.empty((0, 2)))]),
     ]
-    draw_legend(panel, keys, 0, y + 18, 17)
-    return panel
+    legend = blank(50, _PLACES)
+    draw_legend(legend, keys, 0, 30, 17)
+    return [*([line("What was missing", 21, bold=True)] if lines else []), *lines, legend]

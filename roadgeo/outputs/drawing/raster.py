@@ -15,8 +15,8 @@ from roadgeo.errors import OutputError
 from roadgeo.outputs.drawing.layers import LOOKS, Box, Color, Dots, Layer, Lines, Look, Picture, Ring, rgb
 
 __all__ = [
-    "FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "draw_plate", "draw_scale_bar", "encode",
-    "fixed_point", "write_png", "write_text",
+    "FAINT", "INK", "LIT", "SHIFT", "Canvas", "below", "beside", "blank", "draw_legend", "draw_plate", "draw_scale_bar",
+    "encode", "fixed_point", "framed", "line", "write_png", "write_text",
 ]  # fmt: skip
 
 LIT, INK, FAINT = (255, 255, 255), rgb("ink"), rgb("faint")
@@ -145,6 +145,33 @@ def write_text(image: AnyArray, text: str, origin: tuple[int, int], size: int, c
     cv2.putText(image, text, origin, cv2.FONT_HERSHEY_DUPLEX, scale, color, thickness, cv2.LINE_AA)
     (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
     return origin[0] + int(width)
+
+
+def line(text: str, size: int, color: Color = INK, *, bold: bool = False) -> AnyArray:
+    """Return a picture of a line of text, as wide as that is."""
+    picture = blank(round(1.45 * size), size * (len(text) + 1))
+    return picture[:, : write_text(picture, text, (0, round(1.1 * size)), size, color, bold)]
+
+
+def below(*pictures: AnyArray, gap: int = 0, width: int = 0) -> AnyArray:
+    """Put pictures below one another, at the left of white paper of a width, by default of the widest."""
+    width = width or max(picture.shape[1] for picture in pictures)
+    paper = blank(sum(map(len, pictures)) + gap * (len(pictures) - 1), width)
+    top = 0
+    for picture in pictures:
+        paper[top : top + len(picture), : picture.shape[1]] = picture[:, :width]
+        top += len(picture) + gap
+    return paper
+
+
+def beside(*pictures: AnyArray, gap: int = 0) -> AnyArray:
+    """Put pictures beside one another, at the top of white paper."""
+    return np.swapaxes(below(*(np.swapaxes(picture, 0, 1) for picture in pictures), gap=gap), 0, 1)
+
+
+def framed(picture: AnyArray, margin: int) -> AnyArray:
+    """Leave room around a picture."""
+    return np.pad(picture, ((margin, margin), (margin, margin), (0, 0)), constant_values=255)
 
 
 def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int, size: int) -> None:
