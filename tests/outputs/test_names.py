@@ -10,7 +10,7 @@ import rasterio
 from worlds.demo import DRONE
 
 from roadgeo.cli import main
-from roadgeo.outputs.names import bare_command, bare_name, bare_names, table_cell, without_folders
+from roadgeo.outputs.names import bare_command, bare_name, bare_names, without_folders
 from roadgeo.outputs.registry import ALSO
 
 
@@ -47,12 +47,6 @@ def test_names_that_are_shared_keep_the_folders_in_which_they_differ(paths: list
 )
 def test_sentences_without_folders(text: str, left: str) -> None:
     assert without_folders(text, "my own/a.png") == left
-
-
-@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-x.png", "@SUM(A1)", "\t=1"])
-def test_no_cell_is_a_formula(text: str) -> None:
-    assert table_cell(text) == f"'{text}"
-    assert table_cell("drone=1.png") == "drone=1.png"
 
 
 def test_a_command_without_folders() -> None:

@@ -108,12 +108,6 @@ def test_nothing_is_drawn_over_the_title_or_the_legend(
     assert (picture[top : -(top // 2), :panel] == FRAME).all(axis=2).any()
 
 
-def test_the_photograph_of_a_result_is_drawn(tmp_path: Path) -> None:
-    write_overlay(tmp_path / "a.png", shown(photo=photograph(tmp_path, (40, 60), 60)))
-    drawn = cv2.imread(str(tmp_path / "a.png"))
-    assert (drawn == (30, 200, 10)).all(axis=2).sum() > 10_000
-
-
 def test_the_picture_is_written(tmp_path: Path) -> None:
     write_overlay(tmp_path / "a.png", shown())
     drawn = draw_overlay(shown())

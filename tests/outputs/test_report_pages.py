@@ -220,14 +220,6 @@ def test_a_photograph_is_shown_in_place_of_the_mask(
         render_report(found, drone, porto.index, picture=tmp_path / "missing.png")
 
 
-def test_a_mask_is_traced_once(
-    porto: Reference, drone: RoadMask, found: Location, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    anew = render_report(replace(found, seen=None), drone, porto.index)
-    monkeypatch.setattr("roadgeo.outputs.subject.trace_query", None)
-    assert render_report(found, drone, porto.index) == anew
-
-
 def test_the_report_is_written_in_one_step(porto: Reference, drone: RoadMask, found: Location, tmp_path: Path) -> None:
     refused, options = replace(found, status="not_located"), OutputOptions(products=("report",))
     write_location(refused, drone, output_paths(tmp_path, "drone"), options, indexes=[porto.index])
@@ -522,18 +514,6 @@ def test_both_views_show_the_ground_under_the_pointer(browser: Browser, report: 
         x, y, _ = view(page)
         said = page.run("document.querySelector('main > .viewer .position').textContent")
         assert np.array(re.findall(r"[\d.]+", said), float) == pytest.approx([west + x, north - y], abs=5)
-
-
-def test_a_mask_without_a_place_opens_too(browser: Browser, porto: Reference, tmp_path: Path) -> None:
-    mask = read_mask(MASKS["elsewhere"].path)
-    path = tmp_path / "elsewhere_report.html"
-    path.write_text(render_report(locate(mask, porto), mask, porto.index, ATTRIBUTION), encoding="utf-8")
-    with browser.open(path, 390, 844, phone=True) as page:
-        start = view(page)
-        page.run("document.querySelector('[data-act=in]').click()")
-        page.settle()
-        assert view(page)[2] < start[2]
-        assert page.complaints() == []
 
 
 def test_the_list_leads_to_the_reports(browser: Browser, report: Path, porto: Reference, found: Location) -> None:

@@ -3,6 +3,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import shapely
 from outputs.test_location_files import located, road_mask
 
@@ -18,12 +19,13 @@ from roadgeo.storage.geopackage import read_layer
 RING = [[-8.61, 41.16], [-8.60, 41.16], [-8.60, 41.15], [-8.61, 41.15]]
 
 
-def test_no_cell_of_the_table_is_a_formula(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["=HYPERLINK(0).png", "=cmd|' -C calc'!A0", "+1", "-x.png", "@SUM(A1)", "\t=1"])
+def test_no_cell_of_the_table_is_a_formula(text: str, tmp_path: Path) -> None:
     """A name, or the attribution of a map of somebody else, would be computed by a spreadsheet."""
-    found = {**located().to_dict(), "footprint_lonlat": RING, "query": "=HYPERLINK(0).png", "attribution": "@SUM(A1)"}
+    found = {**located().to_dict(), "footprint_lonlat": RING, "query": text, "attribution": text, "reference": "a=1"}
     with write_summary(tmp_path, [found])[1].open(newline="") as lines:
         (row,) = csv.DictReader(lines)
-    assert (row["query"], row["attribution"]) == ("'=HYPERLINK(0).png", "'@SUM(A1)")
+    assert (row["query"], row["attribution"], row["reference"]) == (f"'{text}", f"'{text}", "a=1")
     assert float(row["lon"]) < 0
 
 

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.vectorized import draw_vectorized, write_vectorized
@@ -70,10 +69,3 @@ def test_a_large_picture_takes_little_more_memory_than_itself() -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 12 * picture.nbytes  # with numbers of eight bytes for all of it, it was 30 times that
-
-
-def test_a_folder_that_cannot_be_made(tmp_path: Path, mask: RoadMask) -> None:
-    (tmp_path / "file").touch()
-    graph = vectorize(mask).graph
-    with pytest.raises(OutputError, match="choose a folder, not a file"):
-        write_vectorized(tmp_path / "file", "a", mask, graph, find_intersections(graph))
