@@ -50,11 +50,11 @@ def test_lines_are_chosen_by_their_labels_each_once(tmp_path):
 
 def test_a_line_across_half_the_world_is_found_where_its_vertices_lie(tmp_path):
     spool = Spool(tmp_path, 0.05)
-    spool.add(np.array([shapely.LineString([(-179.99, 10.0), (179.99, 10.01)])], object))
-    assert len(spool.cells()) == 2
+    spool.add(np.array([shapely.LineString([(-179.99, 10.0), (179.99, 10.01)])], object), np.array([["", ""]], object))
     lines, labels = spool.read((179.9, 9.9, 180.0, 10.1))
     assert len(lines) == 1
     assert labels.tolist() == [["", ""]]
+    assert len(spool.read((0.0, 9.9, 1.0, 10.1))[0]) == 0
 
 
 # --- where a map is cut -----------------------------------------------------------------------------------------------
