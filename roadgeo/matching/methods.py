@@ -189,13 +189,10 @@ def _search(
     ledger.n_reference = sum(found.n_searched for found, estimator in begun if estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
-    def same(one: Search[Hypothesis], a: Hypothesis, other: Search[Hypothesis], b: Hypothesis) -> bool:
-        return _same_ground(estimators[one], a, estimators[other], b)
-
     scale = larger(sum(found.n_searched for found, _ in begun))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
-    search_together(list(estimators), limits, same, rivals)
+    rivals = Rivals(estimators, ledger, options.min_log10_odds, left, _same_ground)
+    search_together(list(estimators), limits, rivals)
     sweeps.end()
     searches = iter(estimators)
     return [found if one is None else _end(found, one, next(searches), rivals, scale) for found, one in begun]

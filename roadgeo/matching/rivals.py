@@ -28,8 +28,8 @@ from roadgeo.geometry.camera import CameraFault, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.evidence import Evidence, match_intersections
-from roadgeo.matching.growing import Hypothesis
+from roadgeo.matching.evidence import Evidence, match_intersections, statement_px
+from roadgeo.matching.growing import Hypothesis, SamePlace
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Peak, Picture
 from roadgeo.matching.refinement import refine
@@ -120,11 +120,16 @@ class Rivals:
         ledger: Ledger,
         needed: float,
         time_limit_s: float = math.inf,
+        same: SamePlace = lambda *_: False,
     ) -> None:
-        """Places with a score below `needed` are not compared; no place is compared after the time limit."""
-        self.estimators, self.ledger, self.needed = estimators, ledger, needed
+        """Places with a score below `needed` are not compared; no place is compared after the time limit.
+
+        `same` returns whether places of two parts, which may overlap, are the same.
+        """
+        self.estimators, self.ledger, self.needed, self._same = estimators, ledger, needed, same
         self._deadline = time.perf_counter() + time_limit_s
-        self._known: dict[int, Standing] = {}  # by the place's id, which is not reused while its standing exists
+        # by the ids of the place and of those that were met, which are not reused while a standing exists
+        self._known: dict[tuple[int, ...], Standing] = {}
         self._doubts: dict[int, tuple[FloatArray, float]] = {}  # with the matrix as it was then
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
@@ -133,7 +138,17 @@ class Rivals:
         if max((model.log10_odds for model in self.estimators[best].verified), default=-math.inf) < self.needed:
             return None  # a place that was met is already too good a rival
         standing = self._by_roads(best)
-        return best if standing is not None and standing.log10_lead >= 2.0 * self.needed else None
+        if standing is None or standing.log10_lead < 2.0 * self.needed:
+            return None
+        return None if any(self._rivals(part, best, standing.model) for part in parts) else best
+
+    def _rivals(self, part: Search[Hypothesis], best: Search[Hypothesis], model: Hypothesis) -> bool:
+        """Return whether another part has another place that explains nearly as much as the best place of all."""
+        here, there = self.estimators[best], self.estimators[part]
+        least = here.explained(model) - self.needed * statement_px(sampling(model.matrix, here.scene.size))
+        return part is not best and any(
+            there.explained(other) > least and not self._same(here, model, there, other) for other in there.verified
+        )
 
     def _explained(self, part: Search[Hypothesis]) -> float:
         estimator = self.estimators[part]
@@ -209,8 +224,9 @@ class Rivals:
         started = time.perf_counter()
         best = max(ranked[:_N_KNOWN], key=lambda model: model.log10_likelihood - self.doubt(estimator, model))
         for _ in range(_MOST_TURNS):
-            standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
-            self._known[id(best)] = standing
+            key = id(best), *map(id, ranked[: 1 + _N_KNOWN])
+            standing = self._known.get(key) or self._compare(estimator, best, ranked)
+            self._known[key] = standing
             if standing.rival is None or not standing.is_beaten:
                 break
             best = self._take(estimator, standing.rival, ranked)

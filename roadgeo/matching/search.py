@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 __all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search", "search_together"]
@@ -38,9 +37,6 @@ class Estimator(Protocol[Model]):
     def score(self, model: Model) -> float:
         """Return the log10 odds of a model."""
 
-    def same(self, a: Model, b: Model) -> bool:
-        """Return whether two models are the same answer."""
-
 
 @dataclass(frozen=True)
 class SearchOptions:
@@ -48,8 +44,8 @@ class SearchOptions:
 
     Attributes
     ----------
-    accept, margin : float
-        A model stands out if it reaches `accept`, and leads the best different model by `margin`.
+    accept : float
+        A model that reaches it may end the search.
     work_limit_s : float
         No further round begins, and no further model is scored, after this work: seconds of a usual machine, counted,
         not measured, so that answers do not depend on the load. The limit holds for a map of 15,000 intersections; on a
@@ -59,7 +55,6 @@ class SearchOptions:
     """
 
     accept: float = 8.0
-    margin: float = 4.0
     work_limit_s: float = 10.0
     time_limit_s: float = 60.0
 
@@ -84,8 +79,8 @@ class Search(Generic[Model]):
 
     Attributes
     ----------
-    leaders : list of (score, model)
-        The best model of each of the two best answers, the best first.
+    score, best : float, Model or None
+        The best model and its score; -inf and None without a model.
     stage : int
         Number of the stage that comes next.
     ended : bool
@@ -100,7 +95,7 @@ class Search(Generic[Model]):
     def __init__(self, estimator: Estimator[Model]) -> None:
         """Begin, without doing anything yet."""
         self.estimator = estimator
-        self.leaders: list[tuple[float, Model]] = []
+        self.score, self.best = float("-inf"), None  # type: float, Model | None
         self.stage = self.n_rounds = self.n_scored = 0
         self.ended = False
         self.stopped = ""
@@ -108,16 +103,6 @@ class Search(Generic[Model]):
         self._charged_s = 0.0
         self._stages = estimator.stages()
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
-
-    @property
-    def score(self) -> float:
-        """Score of the best answer, -inf without an answer."""
-        return self.leaders[0][0] if self.leaders else float("-inf")
-
-    @property
-    def best(self) -> Model | None:
-        """The best model."""
-        return self.leaders[0][1] if self.leaders else None
 
     def advance(self, budget: _Budget) -> None:
         """Do a round, or pass to the next stage after the last round."""
@@ -136,7 +121,9 @@ class Search(Generic[Model]):
     def _take(self, models: Iterable[Model], budget: _Budget) -> None:
         """Score the models of a round."""
         for model in models:
-            self._enter(self.estimator.score(model), model)
+            score = self.estimator.score(model)
+            if self.best is None or score > self.score:
+                self.score, self.best = score, model
             self.n_scored += 1
             self._charge(budget)
             if budget.spent:
@@ -147,12 +134,6 @@ class Search(Generic[Model]):
         work = self.estimator.work
         budget.left_s -= work - self._charged_s
         self._charged_s = work
-
-    def _enter(self, score: float, model: Model) -> None:
-        """Keep the two best different answers after a new one came in."""
-        ranked = sorted([*self.leaders, (score, model)], key=lambda item: -item[0])
-        others = (item for item in ranked[1:] if not self.estimator.same(item[1], ranked[0][1]))
-        self.leaders = [ranked[0], *islice(others, 1)]
 
 
 def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> Search[Model]:
@@ -165,18 +146,15 @@ def search(estimator: Estimator[Model], options: SearchOptions | None = None) ->
 def search_together(
     parts: Sequence[Search[Model]],
     options: SearchOptions | None = None,
-    same: Callable[[Search[Model], Model, Search[Model], Model], bool] | None = None,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None = None,
 ) -> None:
     """Search many parts until an answer stands out on all parts, they are exhausted, or a limit is reached.
 
     Each part does a round in turn, stage after stage: the hypotheses of a sample of the query are met on all parts
-    before an answer is accepted. `same` returns whether models of two parts, which may overlap, are the same answer.
-    `proves` returns the part whose answer is proved by other means than its score, or None. It is called when an answer
-    stands out, which is accepted only if proved, and at the end of each stage.
+    before an answer is accepted. `proves` returns the part whose answer stands out from all others, or None. It is
+    called when an answer reaches `SearchOptions.accept`, which is enough without it, and at the end of each stage.
     """
-    options = options or SearchOptions()
-    ended_by = _Together(parts, options, same, proves).run()
+    ended_by = _search(parts, options or SearchOptions(), proves)
     for part in parts:
         if ended_by in ("work", "time") and not part.ended:
             part.stopped = ended_by
@@ -184,55 +162,33 @@ def search_together(
             part.stopped = part.stopped or ("exhausted" if part.ended else "elsewhere")
 
 
-class _Together(Generic[Model]):
-    """The loop over parts; see `search_together`."""
+def _search(
+    parts: Sequence[Search[Model]],
+    options: SearchOptions,
+    proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None,
+) -> str:
+    """Search until an answer is accepted; return why the search ended."""
+    budget, stage = _Budget(options), 0
 
-    def __init__(
-        self,
-        parts: Sequence[Search[Model]],
-        options: SearchOptions,
-        same: Callable[[Search[Model], Model, Search[Model], Model], bool] | None,
-        proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None,
-    ) -> None:
-        self.parts, self.options, self.same, self.proves = parts, options, same, proves
-        self.budget = _Budget(options)
-
-    def run(self) -> str:
-        stage = 0
-        while not all(part.ended for part in self.parts):
-            while here := [part for part in self.parts if part.stage == stage and not part.ended]:
-                for part in here:
-                    part.advance(self.budget)
-                    if spent := self.budget.spent:
-                        return spent
-                best = next(filter(self._stands_out, here), None)
-                if best is not None and self._is_proved(best):
-                    return "accepted"
-            if self.proves is not None and self._is_proved(None):
-                return "accepted"
-            stage += 1
-        return "exhausted"
-
-    def _is_proved(self, best: Search[Model] | None) -> bool:
-        """Return whether an answer ends the search: `best`, or, if a proof is required, a proved answer."""
-        proved = best if self.proves is None else self.proves(self.parts)
+    def accepts(best: Search[Model] | None) -> bool:
+        proved = best if proves is None else proves(parts)
         if proved is not None:
             proved.stopped = "accepted"
         return proved is not None
 
-    def _stands_out(self, part: Search[Model]) -> bool:
-        """Return whether a part's best answer leads every other answer, on any part."""
-        if part.score < self.options.accept:
-            return False
-        best = part.leaders[0][1]
-        if any(part.score - score < self.options.margin for score, _ in part.leaders[1:]):
-            return False
-        return all(
-            part.score - score >= self.options.margin or (self.same is not None and self.same(part, best, other, model))
-            for other in self.parts
-            if other is not part
-            for score, model in other.leaders
-        )
+    while not all(part.ended for part in parts):
+        while here := [part for part in parts if part.stage == stage and not part.ended]:
+            for part in here:
+                part.advance(budget)
+                if spent := budget.spent:
+                    return spent
+            best = max(here, key=lambda part: part.score)
+            if best.score >= options.accept and accepts(best):
+                return "accepted"
+        if accepts(None):
+            return "accepted"
+        stage += 1
+    return "exhausted"
 
 
 Item = TypeVar("Item")

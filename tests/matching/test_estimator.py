@@ -43,7 +43,6 @@ def test_finds_where_a_camera_looked(town, tilt, sight):
         scene = scene_of(look(network, truth, sight=sight, seed=seed))
         result, estimator = locate(scene, index)
         assert result.score >= ACCEPT
-        assert all(result.score - score > 6 for score, _ in result.leaders[1:])
         assert result.stopped == "accepted"
         assert gap(result, truth, scene) < 6
         assert np.hypot(*(estimator.center(result.best) - mapped(truth, scene.center[None])[0])) < 2

@@ -100,8 +100,11 @@ def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeyp
     truth, _, evidence = broken
     monkeypatch.setattr(rivals, "similar_places", lambda *_: [])
     far = move_about(Homography(truth)(evidence.scene.center), Shift(-550.0, 450.0, 0.0, 1.0, 0.0)) @ truth
-    alone = stand(broken, truth)
-    both = stand(broken, truth, far)
+    item, estimator = search_of(broken, truth)
+    asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
+    alone = asked.standing(item)
+    estimator.score(Hypothesis.at(far, evidence.scene, broken[1]))
+    both = asked.standing(item)  # it was met after the place was compared
     assert alone.rival is None
     assert apart(broken, both.rival, far) < 5.0
     assert both.log10_lead <= alone.log10_lead
@@ -237,6 +240,14 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     assert Rivals(both, Ledger(n_reference=866), half)([empty, first]) is first
     assert Rivals(both, Ledger(n_reference=15_000 * 10**4), half)([empty, first]) is None
     assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, first]) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_same", [False, True])
+def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, is_same):
+    both = dict(search_of(broken, broken[0]) for _ in range(2))
+    proved = Rivals(both, Ledger(n_reference=866), 1.0, same=lambda *_: is_same)(list(both))
+    assert (proved is not None) is is_same
 
 
 @pytest.mark.slow

@@ -110,7 +110,6 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     assert quick.score < 3.5
     full = search(TripleEstimator(scene, index, MatchOptions()), limits)
     assert full.score > 6
-    assert all(full.score - score > 4 for score, _ in full.leaders[1:])
     assert corner_gap(full.best.refined.matrix, scene) < 6
     assert full.best.by_roads
 
