@@ -12,6 +12,7 @@ from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import build_index
+from roadgeo.matching.rivals import Rivals
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions
 
@@ -129,9 +130,10 @@ def towns():
 
 def search_all(scene, indexes, options=None):
     ledger, sweeps = Ledger(sum(map(len, indexes))), SharedSweeps(scene, CameraOptions())
-    parts = [Search(TripleEstimator(scene, index, options, ledger=ledger, sweeps=sweeps)) for index in indexes]
-    search_together(parts, SearchOptions(time_limit_s=60.0))
-    return parts
+    estimators = [TripleEstimator(scene, index, options, ledger=ledger, sweeps=sweeps) for index in indexes]
+    parts = {Search(estimator): estimator for estimator in estimators}
+    search_together(list(parts), SearchOptions(time_limit_s=60.0), Rivals(parts, ledger, 3.5))
+    return list(parts)
 
 
 @pytest.mark.slow
