@@ -127,9 +127,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
 
     require_file(path)
     refuse_named_files(path)
-    _require_stored(path)
-    if layer is not None:
-        _require_stored(path, layer)
+    _require_stored(path, layer)
     file = path
     try:
         with _few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
@@ -201,32 +199,21 @@ def _offline() -> Iterator[None]:
         os.environ.update(exempt)
 
 
-def _require_stored(path: Path, layer: str | None = None) -> None:
-    """Refuse what an SQLite file computes in place of storing it: its GeoPackage tables, or the layer."""
-    if not path.is_file():
+def _require_stored(path: Path, layer: str | None) -> None:
+    """Refuse what an SQLite file computes in place of storing it: its own tables, which GDAL reads, and the layer."""
+    if not path.is_file() or not _head(path).startswith(b"SQLite format 3\0"):
         return
-    with path.open("rb") as file:
-        if file.read(16) != b"SQLite format 3\0":
-            return
     try:
         with opened(path) as database:
-            problems = _computed(database, layer)
+            names = [name for (name,) in database.execute(_OWN_TABLES)] + ([] if layer is None else [layer])
+            problem = next(filter(None, (table_problem(database, name) for name in names)), "")
+            if layer is not None and not problem:
+                quoted = '"' + layer.replace('"', '""') + '"'
+                database.execute(f"SELECT sum(1) FROM {quoted}").fetchone()  # noqa: S608 - ends within the work allowed
     except sqlite3.Error as error:
         raise RoadSourceError(f"{path}: not readable as SQLite: {error}") from error
-    if problems:
-        raise RoadSourceError(f"{path}: {problems[0]}; save the roads as a table of their own")
-
-
-def _computed(database: sqlite3.Connection, layer: str | None) -> list[str]:
-    """Return the computed columns and tables: GeoPackage's own, which GDAL reads in any case, or one layer's."""
-    if layer is None:
-        names = [name for (name,) in database.execute(_OWN_TABLES)]
-        return [problem for problem in (table_problem(database, name) for name in names) if problem]
-    problem = table_problem(database, layer)
-    if not problem:
-        quoted = '"' + layer.replace('"', '""') + '"'
-        database.execute(f"SELECT sum(1) FROM {quoted}").fetchone()  # noqa: S608 - ends, within the work allowed
-    return [problem] if problem else []
+    if problem:
+        raise RoadSourceError(f"{path}: {problem}; save the roads as a table of their own")
 
 
 def first_line(error: BaseException) -> str:

@@ -136,22 +136,12 @@ def test_limits_are_where_they_are_said_to_be(rough, slack_deg, slack):
         assert fault(np.diag([1.0, np.exp(stretch), 1.0])) is expected
 
 
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("axis", [0, 1])
-def test_the_horizon_must_not_come_too_near_to_a_corner(axis, side):
+@pytest.mark.parametrize("lean", [(-1, 0), (1, 0), (0, -1), (0, 1), (-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
+def test_the_horizon_must_not_come_too_near_to_a_corner(lean):
     """The least w over the frame is at least a twentieth of that in its middle."""
     for least, too_near in [(0.049, True), (0.051, False)]:
         about_middle = np.eye(3)
-        about_middle[2, axis] = side * (1.0 - least) / (SIZE[axis] / 2)  # w = 1 in the middle
-        matrix = about_middle @ np.array([[1.0, 0, -SIZE[0] / 2], [0, 1, SIZE[1] / 2], [0, 0, 1]])
-        assert (judge(matrix, SIZE, OPTIONS) is CameraFault.HORIZON) is too_near
-
-
-@pytest.mark.parametrize("corner", [(-1, -1), (-1, 1), (1, -1), (1, 1)])
-def test_the_horizon_must_not_come_too_near_to_any_one_corner(corner):
-    for least, too_near in [(0.045, True), (0.055, False)]:
-        about_middle = np.eye(3)
-        about_middle[2, :2] = np.array(corner) * (1.0 - least) / np.array(SIZE)  # each side takes half of it off
+        about_middle[2, :2] = 2.0 * np.array(lean) * (1.0 - least) / np.array(SIZE)  # w = 1 in the middle
         matrix = about_middle @ np.array([[1.0, 0, -SIZE[0] / 2], [0, 1, SIZE[1] / 2], [0, 0, 1]])
         assert (judge(matrix, SIZE, OPTIONS) is CameraFault.HORIZON) is too_near
 
