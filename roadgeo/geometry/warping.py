@@ -122,7 +122,7 @@ def warp(
             else:
                 picture = image.shape[1], image.shape[0]
                 seen = source_pixels(pixel_to_crs, grid, column, row, size, picture, to_place, lens)
-                columns, rows = np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32)
+                columns, rows = cv2.split(np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32))
                 block[...] = cv2.remap(image, columns, rows, interpolation)
     return drawn
 
@@ -137,7 +137,7 @@ def source_pixels(
     to_place: Transform = None,
     lens: Lens | None = None,
 ) -> FloatArray:
-    """Image pixels (2, rows, columns; corner convention) that lie at the centres of a block of a grid; NaN if nowhere.
+    """Image pixels (rows, columns, 2; corner convention) that lie at the centres of a block of a grid; NaN if nowhere.
 
     The block begins at `column`, `row` and has `size` (width, height); the image has `picture` (width, height) pixels.
     They are exact at some nodes and bilinear between, nowhere further off than `_NODE_ERROR_PX` in the image.
@@ -161,10 +161,10 @@ def source_pixels(
         middles = see(put(*(_every(step, n + 1) for n in cells)))
         near = np.asarray((np.abs(middles / picture - 0.5) < 0.75).all(axis=2))
         if _is_near(_between(see(nodes)), middles, near):
-            return np.moveaxis(_resize(see(nodes), step, size), 2, 0)
+            return _resize(see(nodes), step, size)
         if _is_near(see(_between(nodes)), middles, near):
-            return np.moveaxis(see(_resize(nodes, step, size)), 2, 0)
-    return np.moveaxis(see(put(*(_every(1, side) + 0.5 for side in size))), 2, 0)
+            return see(_resize(nodes, step, size))
+    return see(put(*(_every(1, side) + 0.5 for side in size)))
 
 
 def _between(nodes: FloatArray) -> FloatArray:
@@ -177,11 +177,8 @@ def _is_near(found: FloatArray, exact: FloatArray, near: AnyArray) -> bool:
 
 def _resize(nodes: FloatArray, step: int, size: tuple[int, int]) -> FloatArray:
     """Return positions at all pixels of a block, bilinear between those at its nodes."""
-    fine = np.empty((size[1], size[0], 2))
-    for axis in (0, 1):
-        whole = cv2.resize(nodes[..., axis], None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
-        fine[..., axis] = whole[step : step + size[1], step : step + size[0]]
-    return fine
+    fine = np.asarray(cv2.resize(nodes, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR), np.float64)
+    return fine[step : step + size[1], step : step + size[0]]
 
 
 def _every(step: int, n: int) -> FloatArray:

@@ -53,6 +53,8 @@ _INTERPOLATION = {
 }
 _BLOCK = 512  # side of the blocks that are drawn one after another
 _BORDER = cv2.BORDER_REPLICATE
+_BANDS = 4  # that OpenCV looks up at a time
+_SEEN = 255  # in OpenCV's masks
 _REACH = 8  # pixels around a block's source that interpolation may look at
 _TILED_BYTES = 1 << 28  # larger pictures that can only be read from the top down are first copied into tiles
 _MAX_SOURCE = 8192  # sides of a block's source beyond which it is read coarser
@@ -318,7 +320,8 @@ def _draw(plan: _Plan, path: Path, crs: str, tags: Mapping[str, str]) -> None:
         for column, row, block in _blocks(plan):
             for level, sink in enumerate(sinks):
                 block = _halve(block, plan) if level else block
-                sink.write(block, window=Window(column >> level, row >> level, block.shape[2], block.shape[1]))
+                window = Window(column >> level, row >> level, block.shape[1], block.shape[0])
+                sink.write(np.moveaxis(block, 2, 0), window=window)
 
 
 def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) -> dict[str, Any]:
@@ -335,17 +338,16 @@ def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) 
 
 
 def _halve(block: AnyArray, plan: _Plan) -> AnyArray:
-    """Return a block (bands, rows, columns) at half the size; transparent pixels do not darken their neighbours."""
+    """Return a block (rows, columns, bands) at half the size; transparent pixels do not darken their neighbours."""
     if plan.interpolation == cv2.INTER_NEAREST:
-        return np.ascontiguousarray(block[:, ::2, ::2])
+        return np.ascontiguousarray(block[::2, ::2])
     opaque = np.iinfo(plan.dtype).max
-    even = np.pad(block, ((0, 0), (0, block.shape[1] % 2), (0, block.shape[2] % 2)), mode="edge")
-    size = even.shape[2] // 2, even.shape[1] // 2
-    half = np.stack([cv2.resize(band, size, interpolation=cv2.INTER_AREA) for band in even])
-    at_edge = (half[-1] > 0) & (half[-1] < opaque)
+    even = cv2.copyMakeBorder(block, 0, block.shape[0] % 2, 0, block.shape[1] % 2, _BORDER)
+    half: AnyArray = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    at_edge = (half[..., -1] > 0) & (half[..., -1] < opaque)
     if at_edge.any():
-        half[:-1, at_edge] = _cast(half[:-1, at_edge] * (opaque / half[-1, at_edge]), plan.dtype)
-        half[-1, at_edge] = opaque
+        half[at_edge, :-1] = _cast(half[at_edge, :-1] * (opaque / half[at_edge, -1:]), plan.dtype)
+        half[at_edge, -1] = opaque
     return half
 
 
@@ -375,7 +377,7 @@ def _optimize(drawn: Path, target: str | os.PathLike[str], options: ImageOptions
 
 
 def _blocks(plan: _Plan) -> Iterator[tuple[int, int, AnyArray]]:
-    """Draw block after block: column, row, and (bands, rows, columns); transparent ones are left out.
+    """Draw block after block: column, row, and (rows, columns, bands); transparent ones are left out.
 
     All reading is done here, for GDAL's settings belong to a thread; a few blocks are drawn at a time.
     """
@@ -384,12 +386,12 @@ def _blocks(plan: _Plan) -> Iterator[tuple[int, int, AnyArray]]:
         begun: deque[tuple[int, int, Future[AnyArray]]] = deque()
         for column, row, size in _cut_up(plan.grid):
             pixels = source_pixels(plan.homography, plan.grid, column, row, size, plan.size, plan.to_place, plan.lens)
-            inside = (pixels[0] > 0) & (pixels[0] < plan.size[0]) & (pixels[1] > 0) & (pixels[1] < plan.size[1])
+            inside = cv2.inRange(pixels, (0.0, 0.0), plan.size)
             if inside.any():
                 part = _read_part(plan, pixels, inside)
                 begun.append((column, row, pool.submit(_draw_block, plan, part, pixels, inside)))
             elif not plan.has_alpha:
-                empty = (len(plan.bands), *size[::-1])
+                empty = (*size[::-1], len(plan.bands))
                 begun.append((column, row, pool.submit(np.full, empty, plan.nodata, plan.dtype)))
             while len(begun) > 2 * n_threads:
                 column, row, block = begun.popleft()
@@ -405,42 +407,40 @@ def _cut_up(grid: MapGrid) -> Iterator[tuple[int, int, tuple[int, int]]]:
 
 
 class _Part(NamedTuple):
-    """A window of a picture: (bands, rows, columns), and where they are known; None: everywhere."""
+    """A window of a picture: (rows, columns, bands), and where they are known; None: everywhere."""
 
     window: Window
     values: AnyArray
     known: BoolArray | None
 
 
-def _read_part(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> _Part:
+def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Part:
     """Read what a block needs."""
     window = _source_window(plan, pixels, inside)
     shape, palette = _reduced_shape(plan, window), plan.palette
     averaged = Resampling.average if palette is None else Resampling.nearest
-    values = plan.picture.read(plan.bands, window=window, out_shape=shape, resampling=averaged)
+    values = np.empty(shape, plan.dtype)
+    plan.picture.read(plan.bands, window=window, out=np.moveaxis(values, 2, 0), resampling=averaged)
     if palette is not None:
-        values = np.moveaxis(palette[values[0]], 2, 0)
-    return _Part(window, values, plan.known(window, shape[1:]))
+        values = palette[values[..., 0]]
+    return _Part(window, values, plan.known(window, shape[:2]))
 
 
-def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: BoolArray) -> AnyArray:
+def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: AnyArray) -> AnyArray:
     window, values, known = part
-    corner = np.array([window.col_off, window.row_off])[:, None, None]
-    factors = np.array([values.shape[2] / window.width, values.shape[1] / window.height])[:, None, None]
-    maps = ((pixels - corner) * factors - 0.5).astype(np.float32)
+    across, along = values.shape[1] / window.width, values.shape[0] / window.height
+    from_center = [[across, 0.0, -across * window.col_off - 0.5], [0.0, along, -along * window.row_off - 0.5]]
+    maps = cv2.transform(pixels, np.array(from_center)).astype(np.float32)
     image = _sample(values, maps, known, plan)
-    seen = inside if known is None else inside & (_remap(known.view(np.uint8)[None], maps, cv2.INTER_NEAREST)[0] > 0)
-    if not plan.has_alpha:
-        image[:, ~seen] = plan.nodata
-        return image
-    image *= seen
-    opaque = seen * plan.dtype.type(np.iinfo(plan.dtype).max)
-    return np.concatenate([image, opaque[None]])
+    if known is not None:
+        inside = cv2.min(inside, _remap(_SEEN * known.view(np.uint8)[..., None], maps, cv2.INTER_NEAREST))
+    image[inside == 0] = plan.nodata or 0
+    return cv2.merge((image, inside * plan.dtype.type(np.iinfo(plan.dtype).max // _SEEN))) if plan.has_alpha else image
 
 
-def _source_window(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> Window:
+def _source_window(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> Window:
     """Return the part of the picture that a block needs."""
-    ends = [cv2.minMaxLoc(axis, inside.view(np.uint8))[:2] for axis in pixels]
+    ends = [cv2.minMaxLoc(axis, inside)[:2] for axis in cv2.split(pixels)]
     left, top = (max(math.floor(low) - _REACH, 0) for low, _ in ends)
     right, bottom = (min(math.ceil(high) + _REACH, side) for (_, high), side in zip(ends, plan.size, strict=True))
     return Window(left, top, right - left, bottom - top)
@@ -449,25 +449,25 @@ def _source_window(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> Window
 def _reduced_shape(plan: _Plan, window: Window) -> tuple[int, int, int]:
     """Shape that a window is read at: its own, unless far more pixels are asked for than the block can show."""
     factor = max(1.0, window.width / _MAX_SOURCE, window.height / _MAX_SOURCE)
-    return len(plan.bands), max(round(window.height / factor), 1), max(round(window.width / factor), 1)
+    return max(round(window.height / factor), 1), max(round(window.width / factor), 1), len(plan.bands)
 
 
 def _sample(values: AnyArray, maps: AnyArray, known: BoolArray | None, plan: _Plan) -> AnyArray:
-    """Interpolate (bands, rows, columns); unknown pixels have no weight, so that they do not bleed into others."""
+    """Interpolate (rows, columns, bands); unknown pixels have no weight, so that they do not bleed into others."""
     drawable = values if values.dtype in _DRAWABLE else values.astype(np.float64)
     if known is None or plan.interpolation == cv2.INTER_NEAREST:
         return _cast(_remap(drawable, maps, plan.interpolation), plan.dtype)
-    weights = _remap(known.astype(np.float32)[None], maps, plan.interpolation)
+    known = known[..., None]
+    weights = _remap(known.astype(np.float32), maps, plan.interpolation)
     weighted = _remap(np.where(known, drawable, 0).astype(np.float32), maps, plan.interpolation)
     return _cast(weighted / np.maximum(weights, 1e-3), plan.dtype)
 
 
 def _remap(image: AnyArray, maps: AnyArray, interpolation: int) -> AnyArray:
-    """Look up an image (bands, rows, columns) at `maps` (2, h, w); (bands, h, w)."""
-    columns, rows = maps
-    return np.stack(
-        [cv2.remap(np.ascontiguousarray(band), columns, rows, interpolation, borderMode=_BORDER) for band in image]
-    )
+    """Look up an image (rows, columns, bands) at `maps` (h, w, 2), a few bands at a time; (h, w, bands)."""
+    columns, rows = cv2.split(maps)
+    few = (np.ascontiguousarray(image[..., k : k + _BANDS]) for k in range(0, image.shape[2], _BANDS))
+    return np.dstack([cv2.remap(part, columns, rows, interpolation, borderMode=_BORDER) for part in few])
 
 
 def _cast(image: AnyArray, dtype: np.dtype[Any]) -> AnyArray:
