@@ -19,7 +19,7 @@ from typing import Any
 import click
 
 from roadgeo import __version__
-from roadgeo.cli.printing import echo, paint
+from roadgeo.cli.printing import complain, echo
 from roadgeo.errors import RoadgeoError, name_package
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
@@ -110,7 +110,7 @@ def _list_plugins(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
     if asked and not ctx.resilient_parsing:
         from roadgeo.cli.references import list_plugins
 
-        list_plugins(as_json=False)
+        list_plugins()
         ctx.exit()
 
 
@@ -129,8 +129,7 @@ def _list_plugins(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
     callback=_list_plugins,
     help="List the road sources, segmenters and outputs that are installed.",
 )
-@click.pass_context
-def cli(ctx: click.Context) -> None:
+def cli() -> None:
     """Locate aerial images from their roads alone.
 
     \b
@@ -141,8 +140,6 @@ def cli(ctx: click.Context) -> None:
     `roadgeo COMMAND --help` explains each command, with examples; `roadgeo completion --help` how your shell completes
     them.
     """
-    if os.environ.get("NO_COLOR"):
-        ctx.color = False
 
 
 #: Signals of a supervisor, of which the process is about to end.
@@ -197,6 +194,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    error = paint("Error:", "red") + " " + " ".join(message.split())
-    echo(error, err=True, color=False if os.environ.get("NO_COLOR") else None)
+    complain(message)
     return status

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.options import OTHERS, Command, Plugin, each, out_dir_option, row, take
+from roadgeo.cli.options import OTHERS, Command, Plugin, each, row, take
 from roadgeo.cli.printing import echo, tell
 from roadgeo.outputs.registry import offered
 from roadgeo.storage.files import make_folder
@@ -16,7 +16,7 @@ __all__ = ["apply_command"]
 
 
 _OPTIONS = (
-    out_dir_option(),
+    take("out_dir"),
     row("--stretch", "", OTHERS,
         "The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose "
         "pixels are not square."),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import out_dir_option
+from roadgeo.cli.options import take
 from roadgeo.cli.printing import complain, echo
 from roadgeo.outputs.wording import format_lonlat
 
@@ -21,7 +21,7 @@ __all__ = ["demo_command"]
 
 
 @click.command("demo", short_help="Locate a photograph and five masks: needs no network and no data.")
-@out_dir_option("Where everything is written; made if missing.", "roadgeo_demo", show_default=True)
+@take("out_dir", help="Where everything is written; made if missing.", default="roadgeo_demo", show_default=True)
 def demo_command(out_dir: str) -> int:
     """Show the whole way on real data: build references, locate, write every output, compare with the truth.
 

@@ -15,7 +15,7 @@ from click.core import ParameterSource
 
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import OTHERS, Command, each, hinted, make_options, out_dir_option, row, take
+from roadgeo.cli.options import OTHERS, Command, each, hinted, make_options, row, take
 from roadgeo.cli.printing import echo, is_set, tell
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
@@ -48,7 +48,7 @@ _OPTIONS = (
     row("--check", "N", OTHERS,
         "With --map: try N other masks and count those located in each class.",
         type=click.IntRange(0), default=0, rare=True),
-    out_dir_option("Write here, and go on from here.", None, Path),
+    take("out_dir", help="Write here, and go on from here.", default=None),
     take("json", help="Print the figures as one JSON object."),
     take("quiet"),
 )  # fmt: skip
@@ -67,7 +67,7 @@ def evaluate_command(
     as_map: bool,
     height: float | None,
     check: int,
-    out_dir: Path | None,
+    out_dir: str | None,
     **options: Any,
 ) -> None:
     """Locate masks whose place is known, and count.
@@ -94,9 +94,9 @@ def evaluate_command(
     from roadgeo.storage.files import make_folder
 
     _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
-    path = resolve_whole(reference)
-    if out_dir is not None:
-        make_folder(out_dir)
+    path, folder = resolve_whole(reference), None if out_dir is None else Path(out_dir)
+    if folder is not None:
+        make_folder(folder)
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     compile_once()
@@ -107,12 +107,12 @@ def evaluate_command(
     about = {"reference": path.stem, "method": method, **known}
     if as_map:
         survey = _survey(locator, options, about)
-        survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=count_up)
+        survey = replace(survey, check=check, jobs=jobs, out_dir=folder, counting=count_up)
         _write_map(survey)
         return
     query_set, settings = _query_set(path, queries, roads, options)
     settings |= about
-    _evaluate(query_set, locator, settings, radius, jobs, out_dir)
+    _evaluate(query_set, locator, settings, radius, jobs, folder)
 
 
 #: Names of the search's hints in the settings of an evaluation.
@@ -225,7 +225,7 @@ def _recorded(record: Path | None) -> int:
     """Count the trials in a record."""
     if record is None or not record.is_file():
         return 0
-    return max(len(record.read_text(encoding="utf-8").splitlines()) - 1, 0)
+    return max(record.read_text(encoding="utf-8").count("\n") - 1, 0)
 
 
 def _query_set(

@@ -8,7 +8,6 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, reduce
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -45,7 +44,6 @@ __all__ = [
     "make_options",
     "n_threads",
     "open_maps",
-    "out_dir_option",
     "read_options",
     "row",
     "take",
@@ -319,6 +317,9 @@ _SHARED = {
     "references": row("-r --reference references", "REF", WHERE,
         "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
         type=click.Path(), multiple=True),
+    "out_dir": row("-o --out-dir", "DIR", RESULTS,
+        "Folder for the results; made if missing. Default: here.",
+        type=click.Path(file_okay=False), default="."),
     "json": row("--json as_json", "", OTHERS, "Print one JSON object per image and line.", **_KEPT),
     "crs": row("--crs", "CRS", RESULTS, "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.", type=CRS),
     "resolution": row("--resolution", "SIZE", RESULTS,
@@ -378,20 +379,6 @@ def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
         return command
 
     return add_all
-
-
-def out_dir_option(
-    help_text: str = "Folder for the results; made if missing. Default: here.",
-    default: str | None = ".",
-    path_type: type[str] | type[Path] = str,
-    **more: Any,
-) -> Callable[[Decorated], Decorated]:
-    """Make the option of the output folder."""
-    kind = click.Path(file_okay=False, path_type=path_type)
-    add: Callable[[Decorated], Decorated] = row(
-        "-o --out-dir", "DIR", RESULTS, help_text, **{"type": kind, "default": default, **more}
-    )
-    return add
 
 
 # --- what the options come to -----------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ _MARK = f"\ufdd0{os.urandom(8).hex()}"
 
 
 def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
-    """Print lines; control characters in names are shown, not obeyed by the terminal."""
+    """Print lines; control characters in names are shown, not obeyed by the terminal, and NO_COLOR is."""
+    color = False if os.environ.get("NO_COLOR") else color
     click.echo(visible(text, lines=True).replace(_MARK, "\x1b"), err=err, color=color)
 
 

@@ -7,6 +7,7 @@ import os
 import click
 
 from roadgeo.cli import Group
+from roadgeo.cli.options import OTHERS, row
 from roadgeo.cli.printing import echo
 
 __all__ = ["qgis_command"]
@@ -25,13 +26,9 @@ def qgis_command() -> None:
 
 
 @qgis_command.command("install", short_help="Put the plugin into a QGIS profile.")
-@click.option(
-    "--profile",
-    metavar="PROFILE",
-    default="default",
-    show_default=True,
-    help="A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
-)
+@row("--profile", "PROFILE", OTHERS,
+     "A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
+     default="default", show_default=True)  # fmt: skip
 def install_command(profile: str) -> None:
     """Put the plugin into a QGIS profile, in place of an earlier version, and enable it there.
 
@@ -52,17 +49,11 @@ def install_command(profile: str) -> None:
 
 
 @qgis_command.command("package", short_help="Make the plugin's package.")
-@click.option(
-    "-o",
-    "--out",
-    metavar="FILE",
-    help="The package. Default: roadgeo_qgis-VERSION.zip.",
-    type=click.Path(dir_okay=False),
-)
-@click.option("--email", metavar="ADDRESS", help="The publisher's. Default, here and below: as the package says.")
-@click.option("--repository", metavar="URL", help="Where the source code is.")
-@click.option("--tracker", metavar="URL", help="Where to report problems.")
-@click.option("--homepage", metavar="URL", help="Where the documentation is.")
+@row("-o --out", "FILE", OTHERS, "The package. Default: roadgeo_qgis-VERSION.zip.", type=click.Path(dir_okay=False))
+@row("--email", "ADDRESS", OTHERS, "The publisher's. Default, here and below: as the package says.")
+@row("--repository", "URL", OTHERS, "Where the source code is.")
+@row("--tracker", "URL", OTHERS, "Where to report problems.")
+@row("--homepage", "URL", OTHERS, "Where the documentation is.")
 def package_command(out: str | None, **publisher: str | None) -> None:
     """Make the package that QGIS installs (Plugins > Manage and Install Plugins > Install from ZIP).
 

@@ -10,7 +10,8 @@ import click
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, Group
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.printing import complain, echo
+from roadgeo.cli.options import OTHERS, row, take
+from roadgeo.cli.printing import complain, echo, is_set
 
 __all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
 
@@ -34,9 +35,9 @@ def reference_command() -> None:
 
 @reference_command.command("info", short_help="Describe a reference.")
 @click.argument("reference", metavar="REF", type=click.Path(), required=False)
-@click.option("--plugins", is_flag=True, hidden=True, help="The same as `roadgeo --plugins`.")
-@click.option("--json", "as_json", is_flag=True, help="Print everything that is known as one JSON object.")
-def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
+@row("--plugins", "", OTHERS, "The same as `roadgeo --plugins`.", hidden=True)
+@take("json", help="Print everything that is known as one JSON object.")
+def info_command(reference: str | None, plugins: bool) -> None:
     """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
 
     Reads a few kilobytes, whatever the size of the reference, and runs nothing that a file may carry.
@@ -47,7 +48,7 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
       roadgeo reference info maps/porto.gpkg --json
     """
     if plugins:
-        list_plugins(as_json)
+        list_plugins()
         return
     if reference is None:
         raise click.UsageError("Missing argument 'REF'.")
@@ -55,7 +56,7 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
     from roadgeo.reference.library import resolve_reference
 
     described = describe_reference(resolve_reference(reference))
-    if as_json:
+    if is_set("as_json"):
         echo(json.dumps({"schema": SCHEMA, **made_by(), **described}, indent=2))
         return
     width = max(len(label) for label, _ in _lines(described))
@@ -63,21 +64,21 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
         echo(f"{label:<{width}}  {visible(value)}")
 
 
-def list_plugins(as_json: bool) -> None:
+def list_plugins() -> None:
     """Print the plugins that are installed: group, name, package, object."""
     from roadgeo.plugins import GROUPS, find_plugins
 
     found = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
-    rows = [
+    lines = [
         (plugin.group, plugin.name, f"{plugin.dist.name} {plugin.dist.version}" if plugin.dist else "", plugin.value)
         for plugin in found
     ]
-    if as_json:
-        echo(json.dumps([dict(zip(("group", "name", "package", "object"), row, strict=True)) for row in rows]))
+    if is_set("as_json"):
+        echo(json.dumps([dict(zip(("group", "name", "package", "object"), line, strict=True)) for line in lines]))
         return
-    widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
-    for row in rows:
-        echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[3]]))
+    widths = [max((len(line[i]) for line in lines), default=0) for i in range(3)]
+    for line in lines:
+        echo("  ".join([*(text.ljust(width) for text, width in zip(line, widths, strict=False)), line[3]]))
 
 
 @reference_command.command("check", short_help="Test whether the files of references are sound.")
@@ -113,8 +114,8 @@ def check_command(references: tuple[str, ...]) -> int:
 
 
 @reference_command.command("list", short_help="List the references in the library.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per reference and line.")
-def list_command(as_json: bool) -> int:
+@take("json", help="Print one JSON object per reference and line.")
+def list_command() -> int:
     """List the references in the library, which `roadgeo locate` searches without --reference.
 
     The library is a folder of the user's data; the environment variable ROADGEO_LIBRARY names another.
@@ -141,13 +142,13 @@ def list_command(as_json: bool) -> int:
             status = ERROR
             continue
         whole = {"schema": SCHEMA, **made_by(), **described}
-        echo(json.dumps(whole) if as_json else visible(f"{path.stem:<{width}}  {_summary(described)}"))
+        echo(json.dumps(whole) if is_set("as_json") else visible(f"{path.stem:<{width}}  {_summary(described)}"))
     return status
 
 
 @reference_command.command("remove", short_help="Remove references from the library.")
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@click.option("-y", "--yes", is_flag=True, help="Do not ask.")
+@row("-y --yes", "", OTHERS, "Do not ask.")
 def remove_command(names: tuple[str, ...], yes: bool) -> None:
     """Delete references from the library, both files of each.
 

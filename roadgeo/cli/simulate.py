@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import out_dir_option, take
+from roadgeo.cli.options import take
 from roadgeo.cli.printing import tell
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
@@ -18,10 +18,10 @@ __all__ = ["simulate_command"]
 
 @click.command("simulate", short_help="Draw road masks whose place is known.")
 @click.argument("reference", metavar="REF")
-@out_dir_option("Where to write.", None, Path, required=True)
+@take("out_dir", help="Where to write.", default=None, required=True)
 @query_options
 @take("quiet")
-def simulate_command(reference: str, out_dir: Path, roads: Path | None, **options: Any) -> None:
+def simulate_command(reference: str, out_dir: str, roads: Path | None, **options: Any) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
     Writes NOISE/q_NNNN.png, footprints.gpkg, and truth.csv and truth.json, which hold for each mask the homography from
@@ -44,13 +44,13 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, **option
 
     sets = query_sets(options)
     landscape = read_landscape(resolve_whole(reference), roads)
-    truths = []
+    folder, truths = Path(out_dir), []
     with count_up(sum(count for _, count in sets)) as advance:
         for simulation, count in sets:
-            make_folder(out_dir / simulation.kind)
+            make_folder(folder / simulation.kind)
             for k in range(count):
                 query = simulate_query(landscape, simulation, k)
-                write_bytes(out_dir / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
+                write_bytes(folder / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
                 truths.append(query.truth)
                 advance(simulation.kind)
     write_truth(out_dir, truths, made_by())

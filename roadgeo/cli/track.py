@@ -23,7 +23,6 @@ from roadgeo.cli.options import (
     hinted,
     make_options,
     open_maps,
-    out_dir_option,
     read_options,
     row,
     take,
@@ -101,7 +100,7 @@ TIME = Read("time", _read_time)
 _OPTIONS = (
     take("references", "near", "within", "gsd", "max_tilt"),
     take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's."),
-    out_dir_option(),
+    take("out_dir"),
     row("--name", None, RESULTS, "What the results are called. Default: flight.", default="flight", rare=True),
     take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known."),
     take("mavlink", group=RESULTS, rare=True),

@@ -8,7 +8,7 @@ import click
 
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import Command, out_dir_option, read_options, take
+from roadgeo.cli.options import Command, read_options, take
 from roadgeo.cli.printing import complain, echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
@@ -23,8 +23,7 @@ __all__ = ["vectorize_command"]
 
 @click.command("vectorize", cls=Command, short_help="Show what roads are seen in a mask or a photograph.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@out_dir_option()
-@take("gsd", "recursive", "segmenting", "mask_values")
+@take("out_dir", "gsd", "recursive", "segmenting", "mask_values")
 def vectorize_command(
     images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, recursive: bool, **given: Any
 ) -> int:

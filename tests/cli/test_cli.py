@@ -6,11 +6,7 @@ import pytest
 from cli.test_progress import Terminal
 
 from roadgeo.cli import COMMANDS, LazyGroup, cli, main
-from roadgeo.cli.options import ASPECT, BOX, NEAR, RANGE, Read
 from roadgeo.errors import RoadgeoError
-from roadgeo.matching.hints import HINTS
-
-FOCAL = Read("focal", HINTS["focal"].read)
 
 
 def test_help_imports_click_and_nothing_heavy() -> None:
@@ -58,16 +54,10 @@ def test_errors_are_one_line(
     assert out == ""
     assert err.lstrip("\n").startswith(message)  # click ends the line that shows ^C
     assert err.strip().count("\n") == 0
-
-
-def test_a_traceback_is_there_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setenv("ROADGEO_TRACEBACK", "1")
-    monkeypatch.setattr(LazyGroup, "get_command", lambda *_: click.Command("x", callback=fail))
-    with pytest.raises(ZeroDivisionError):
-        main(["x"])
+    if "fault of roadgeo" in message:
+        monkeypatch.setenv("ROADGEO_TRACEBACK", "1")
+        with pytest.raises(type(error)):
+            main(["x"])
 
 
 def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
@@ -78,55 +68,20 @@ def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "text", "numbers"),
-    [
-        (RANGE, "0.5:2", (0.5, 2.0)),
-        (RANGE, "2:2", (2.0, 2.0)),
-        (RANGE, "2", (2.0, 2.0)),
-        (NEAR, "-71.1,42.3,5000", (-71.1, 42.3, 5000.0)),
-        (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
-        (FOCAL, "EXIF", "exif"),
-        (FOCAL, "1200", 1200.0),
-        (ASPECT, "unknown", "unknown"),
-        (ASPECT, "0.25", 0.25),
-        (ASPECT, "4", 4.0),
-    ],
+    ("typed", "offered"),
+    [("ver", "verify"), ("locate --gc", "--gcps"), ("locate --also geoj", "geojson"), ("index --kinds dr", "drivable")],
 )
-def test_numbers_are_read(kind: Read, text: str, numbers: object) -> None:
-    assert kind.convert(text, None, None) == numbers
-    assert kind.convert(numbers, None, None) == numbers
-
-
-@pytest.mark.parametrize(
-    ("kind", "text"),
-    [
-        (RANGE, "2:1"),
-        (RANGE, "0:1"),
-        (RANGE, "a:b"),
-        (RANGE, "1:nan"),
-        (NEAR, "42.3,-171.1,10"),
-        (NEAR, "1,1,0"),
-        (NEAR, "1,1"),
-        (BOX, "1,2,3,2"),
-        (BOX, "1,2,1,4"),
-        (BOX, "1,2,190,4"),
-        *((ASPECT, text) for text in ("0.2", "4.1", "nan", "wide", "")),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(kind: Read, text: str) -> None:
-    with pytest.raises(click.BadParameter, match="expected"):
-        kind.convert(text, None, None)
-
-
-def test_the_shell_completes_commands(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_completes_commands_options_and_their_values(
+    typed: str, offered: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert main(["completion", "bash"]) == 0
     assert "_ROADGEO_COMPLETE=bash_complete" in capfd.readouterr().out
-    environment = {"_ROADGEO_COMPLETE": "bash_complete", "COMP_WORDS": "roadgeo locate --gc", "COMP_CWORD": "2"}
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("_ROADGEO_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", f"roadgeo {typed}")
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split())))
     with pytest.raises(SystemExit):
         main([])
-    assert capfd.readouterr().out == "plain,--gcps\n"
+    assert capfd.readouterr().out == f"plain,{offered}\n"
 
 
 @pytest.mark.parametrize("no_color", ["", "1"])
@@ -151,15 +106,3 @@ def test_colours_appear_on_terminals_that_want_them(no_color: str, monkeypatch: 
 def test_a_mistyped_command_is_asked_about(typed: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(typed.split()) == 2
     assert capfd.readouterr() == ("", f"Error: {message}")
-
-
-@pytest.mark.parametrize(
-    ("kind", "text", "meant"),
-    [
-        (NEAR, "42.36,-171.06,5000", "-171.06,42.36,5000"),
-        (BOX, "42.23,-171.19,42.44,-170.95", "-171.19,42.23,-170.95,42.44"),
-    ],
-)
-def test_exchanged_degrees_are_asked_about(kind: Read, text: str, meant: str) -> None:
-    with pytest.raises(click.BadParameter, match=f"longitude comes first: did you mean {meant}"):
-        kind.convert(text, None, None)

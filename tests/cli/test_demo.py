@@ -25,22 +25,18 @@ def located(mask: DemoMask, east_m: float) -> Outcome:
     return Outcome("located", found)
 
 
-@pytest.mark.parametrize(("east_m", "right"), [(3.0, True), (500.0, False)])
-def test_a_place_is_right_where_it_is_near_the_truth(east_m: float, right: bool) -> None:
-    judged, text = _judge(located(MASKS["drone"], east_m), MASKS["drone"])
-    assert judged is right
-    assert f"the middle is {east_m:.1f} m off, the corners {east_m:.1f} m; 20 intersections matched, 1.00 s" in text
-
-
 @pytest.mark.parametrize(
-    ("stem", "status", "right", "said"),
+    ("stem", "outcome", "right", "said"),
     [
-        ("elsewhere", "not_located", True, "refused, as it should be: why"),
-        ("elsewhere", "located", False, "located, although it is not on this map: why"),
-        ("drone", "not_located", False, "not found, although it is there: why"),
-        ("drone", "error", False, "why"),
+        ("drone", located(MASKS["drone"], 3.0), True, "the middle is 3.0 m off, the corners 3.0 m; 20 intersections"),
+        ("drone", located(MASKS["drone"], 500.0), False, "the middle is 500.0 m off"),
+        ("elsewhere", Outcome("not_located", {"reason": "why"}), True, "refused, as it should be: why"),
+        ("elsewhere", Outcome("located", {"reason": "why"}), False, "located, although it is not on this map: why"),
+        ("drone", Outcome("not_located", {"reason": "why"}), False, "not found, although it is there: why"),
+        ("drone", Outcome("error", {"reason": "why"}), False, "why"),
     ],
 )
-def test_what_else_may_come_out(stem: str, status: str, right: bool, said: str) -> None:
-    outcome = Outcome(status, {"reason": "why"})
-    assert _judge(outcome, MASKS[stem]) == (right, said)
+def test_each_result_is_judged(stem: str, outcome: Outcome, right: bool, said: str) -> None:
+    judged, text = _judge(outcome, MASKS[stem])
+    assert judged is right
+    assert said in text

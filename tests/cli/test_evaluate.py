@@ -98,8 +98,17 @@ def test_an_interrupted_run_says_that_it_can_go_on(town, tmp_path, capsys, monke
     assert run(*options) == 130
     assert "2 of 3 masks are kept; the same command goes on" in capsys.readouterr().err
     monkeypatch.undo()
+    record = tmp_path / "trials.jsonl"
+    kept = record.read_text()
+    assert run(*options, "--seed", 1) == 1
+    assert "another run" in capsys.readouterr().err
+    assert record.read_text() == kept
+    record.write_text(f'{kept}{{"truth": {{"fi')  # as if the power had gone
     assert run(*options) == 0
     assert "3 masks (2 of them recorded before) in" in capsys.readouterr().err
+    first, *lines = record.read_text().splitlines()
+    assert (first, *lines[:2]) == tuple(kept.splitlines())
+    assert [json.loads(line)["truth"]["file"] for line in lines] == [f"clean/q_000{k}.png" for k in range(3)]
 
 
 def test_evaluate_reads_query_sets(town, tmp_path, capsys):

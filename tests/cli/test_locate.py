@@ -152,39 +152,31 @@ def test_the_photograph_is_drawn_in_the_crs_asked_for(
     assert Path("drone_mask_footprint.geojson").exists()
 
 
-def test_photographs_go_with_their_masks(tmp_path: Path) -> None:
-    for name in ("a.jpg", "b_mask.tif"):
-        (tmp_path / name).touch()
-    found = pair_images(["x/a_mask.png", "x/b_mask.png"], [str(tmp_path)])
-    assert found == {"x/a_mask.png": str(tmp_path / "a.jpg"), "x/b_mask.png": str(tmp_path / "b_mask.tif")}
-    assert pair_images(["a.png", "b.png"], ["1.tif", "2.tif"]) == {"a.png": "1.tif", "b.png": "2.tif"}
-    assert pair_images(["a.png"], []) == {}
-    with pytest.raises(click.UsageError, match="2 masks and 1 times --image"):
-        pair_images(["a.png", "b.png"], ["1.tif"])
-    with pytest.raises(click.UsageError, match=r"the name of c\.png"):
-        pair_images(["c.png"], [str(tmp_path)])
-
-
-def test_photographs_lie_beside_labels_logs_and_masks(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    names = (
-        "drone.json",
-        "drone.jpg",
-        "drone.SRT",
-        "drone.txt",
-        "drone.xml",
-        "drone.png",
-        "104_sat.jpg",
-        "104_mask.png",
-    )
-    for name in (*names, "two.tif", "two.png"):
-        (tmp_path / name).touch()
-    mask = str(tmp_path / "drone.png")
-    assert pair_images([mask], [str(tmp_path)]) == {mask: str(tmp_path / "drone.jpg")}
-    with pytest.raises(click.UsageError, match=r"No photograph in .* has the name of .*104_mask\.png"):
-        pair_images([str(tmp_path / "104_mask.png")], [str(tmp_path)])
-    assert not caplog.records
-    assert pair_images(["two_mask.png"], [str(tmp_path)]) == {"two_mask.png": str(tmp_path / "two.tif")}
-    assert "two.tif is drawn, though" in caplog.text
+@pytest.mark.parametrize(
+    ("masks", "images", "paired"),
+    [
+        (["x/a_mask.png", "x/b_mask.png"], ["."], ["a.jpg", "b_mask.tif"]),
+        (["drone.png"], ["."], ["drone.jpg"]),  # beside labels, logs and the mask itself
+        (["two_mask.png"], ["."], ["two.tif"]),
+        (["a.png", "b.png"], ["1.tif", "2.tif"], ["1.tif", "2.tif"]),
+        (["a.png"], [], []),
+        (["a.png", "b.png"], ["1.tif"], "Got 2 masks and 1 times --image"),
+        (["c.png"], ["."], "No photograph in . has the name of c.png"),
+        (["104_mask.png"], ["."], "No photograph in . has the name of 104_mask.png"),
+    ],
+)
+def test_photographs_go_with_their_masks(
+    masks: list[str], images: list[str], paired: list[str] | str, caplog: pytest.LogCaptureFixture
+) -> None:
+    drone = [f"drone{suffix}" for suffix in (".json", ".jpg", ".SRT", ".txt", ".xml", ".png")]
+    for name in (*drone, "a.jpg", "b_mask.tif", "104_sat.jpg", "104_mask.png", "two.tif", "two.png"):
+        Path(name).touch()
+    if isinstance(paired, str):
+        with pytest.raises(click.UsageError, match=re.escape(paired)):
+            pair_images(masks, images)
+    else:
+        assert pair_images(masks, images) == dict(zip(masks, paired, strict=False))
+    assert ("two.tif is drawn, though" in caplog.text) == (masks == ["two_mask.png"])
 
 
 def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

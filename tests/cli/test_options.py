@@ -8,35 +8,18 @@ from pathlib import Path
 
 import click
 import pytest
-from click.shell_completion import ShellComplete
 from hypothesis import given
 from hypothesis import strategies as st
+from support.documents import commands
 
 import roadgeo
 from roadgeo.cli import COMMANDS, cli, main
-from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Plugin, Read
+from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Read
 from roadgeo.matching.hints import HINTS, apply_hints
 from roadgeo.matching.options import LocateOptions
 from roadgeo.serving.requests import read_query_string
 
-
-def offered(*typed: str, incomplete: str) -> list[str]:
-    """What a shell offers in place of the last word."""
-    shell = ShellComplete(cli, {}, "roadgeo", "_ROADGEO_COMPLETE")
-    return [item.value for item in shell.get_completions(list(typed), incomplete)]
-
-
 FOCAL = Read("focal", HINTS["focal"].read)
-
-
-def test_names_of_plugins_are_offered() -> None:
-    plugin = Plugin(lambda: ["geojson", "geometry", "kmz"])
-    assert [item.value for item in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
-
-
-def test_commands_are_offered() -> None:
-    assert offered(incomplete="ver") == ["verify"]
-    assert "vectorize" in offered(incomplete="ve")
 
 
 TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map(str), min_size=1, max_size=5).map(
@@ -45,26 +28,51 @@ TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map
 
 
 @pytest.mark.parametrize(
-    ("kind", "count"), [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2)], ids=["box", "near", "range", "gsd"]
+    ("kind", "count"),
+    [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2), (FOCAL, 1), (ASPECT, 1)],
+    ids=["box", "near", "range", "gsd", "focal", "aspect"],
 )
 @given(text=TEXTS)
-def test_any_text_is_finite_numbers_or_refused(kind: Read, count: int, text: str) -> None:
+def test_any_text_is_finite_numbers_a_word_or_refused(kind: Read, count: int, text: str) -> None:
     try:
         found = kind.convert(text, None, None)
     except click.BadParameter:
         return
-    assert len(found) == count
-    assert all(map(math.isfinite, found))
+    if found not in ("exif", "unknown"):
+        numbers = found if count > 1 else (found,)
+        assert len(numbers) == count
+        assert all(map(math.isfinite, numbers))
+        assert count > 1 or found > 0
 
 
-@given(TEXTS)
-def test_any_text_is_a_length_a_ratio_or_refused(text: str) -> None:
-    for kind in (FOCAL, ASPECT):
-        try:
-            found = kind.convert(text, None, None)
-        except click.BadParameter:
-            continue
-        assert found in ("exif", "unknown") or 0 < float(found) < math.inf
+@pytest.mark.parametrize(
+    ("kind", "text", "read"),
+    [
+        (RANGE, "0.5:2", (0.5, 2.0)),
+        (RANGE, "2:2", (2.0, 2.0)),
+        (RANGE, "2", (2.0, 2.0)),
+        (NEAR, "-71.1,42.3,5000", (-71.1, 42.3, 5000.0)),
+        (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
+        (FOCAL, "EXIF", "exif"),
+        (FOCAL, "1200", 1200.0),
+        (ASPECT, "unknown", "unknown"),
+        (ASPECT, "0.25", 0.25),
+        (ASPECT, "4", 4.0),
+        *((RANGE, text, "expected") for text in ("2:1", "0:1", "a:b", "1:nan")),
+        *((NEAR, text, "expected") for text in ("42.3,-171.1,10", "1,1,0", "1,1")),
+        *((BOX, text, "expected") for text in ("1,2,3,2", "1,2,1,4", "1,2,190,4")),
+        *((ASPECT, text, "expected") for text in ("0.2", "4.1", "nan", "wide", "")),
+        (NEAR, "42.36,-171.06,5000", "longitude comes first: did you mean -171.06,42.36,5000"),
+        (BOX, "42.23,-171.19,42.44,-170.95", "longitude comes first: did you mean -171.19,42.23,-170.95,42.44"),
+    ],
+)
+def test_numbers_are_read_or_what_was_expected_is_said(kind: Read, text: str, read: object) -> None:
+    if isinstance(read, str) and read not in ("exif", "unknown"):
+        with pytest.raises(click.BadParameter, match=read):
+            kind.convert(text, None, None)
+    else:
+        assert kind.convert(text, None, None) == read
+        assert kind.convert(read, None, None) == read
 
 
 # --- one table --------------------------------------------------------------------------------------------------------
@@ -116,10 +124,7 @@ def test_options_of_plugins_dialogs_exist_on_the_command_line() -> None:
     assert said <= known | {"--help", "--version"} | {"--progress-bar", "--disable-pip-version-check"}  # of pip
 
 
-EVERY = [*COMMANDS, *(f"{group} {name}" for group in ("reference", "qgis") for name in command(group).commands)]
-
-
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", [name for name, _ in commands() if name])
 def test_help_fits_on_a_page_and_every_command_shows_all_of_it(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     lines = {}
     for option in ("--help", "--help-all"):

@@ -23,19 +23,14 @@ def walk(say):
     say("writing")
 
 
-def test_elsewhere_each_step_is_one_line(capsys, monkeypatch):
+@pytest.mark.parametrize(("quiet", "said"), [(False, "reading ...\ndrawing ...\nwriting ...\n"), (True, "")])
+def test_elsewhere_each_step_is_one_line_and_quiet_is_quiet(quiet, said, capsys, monkeypatch):
     monkeypatch.delenv("ROADGEO_PROGRESS", raising=False)
-    with show_steps() as say:
-        walk(say)
-    assert capsys.readouterr() == ("", "reading ...\ndrawing ...\nwriting ...\n")
-
-
-def test_quiet_is_quiet(capsys):
     with click.Context(click.Command("index")) as context:
-        context.meta["roadgeo.quiet"] = True
+        context.meta["roadgeo.quiet"] = quiet
         with show_steps() as say:
             walk(say)
-    assert capsys.readouterr() == ("", "")
+    assert capsys.readouterr() == ("", said)
 
 
 def test_programs_get_lines_of_json_each_per_cent_once(capsys, monkeypatch):

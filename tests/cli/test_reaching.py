@@ -8,8 +8,9 @@ from pathlib import Path
 
 import click
 import pytest
+from support.documents import commands
 
-from roadgeo.cli import cli, queries, shards
+from roadgeo.cli import queries, shards
 from roadgeo.cli.locate import locate_command
 from roadgeo.cli.options import read_options
 from roadgeo.cli.track import _frame_options, track_command
@@ -20,17 +21,7 @@ from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import REGISTRY
 from roadgeo.running.options import ReadOptions
 
-
-def commands(group: click.Group, path: str = "") -> list[tuple[str, click.Command]]:
-    found = []
-    for name in group.list_commands(click.Context(group)):
-        command = group.get_command(click.Context(group), name)
-        where = f"{path} {name}".strip()
-        found += commands(command, where) if isinstance(command, click.Group) else [(where, command)]
-    return found
-
-
-ALL = commands(cli)
+ALL = [(name, command) for name, command in commands() if not isinstance(command, click.Group)]
 
 
 def read_in(module: str) -> set[str]:

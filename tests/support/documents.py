@@ -215,22 +215,18 @@ def options_of(command):
     return known
 
 
-def all_options():
-    """All options of all commands."""
-    known, waiting = set(), [cli]
-    while waiting:
-        command = waiting.pop()
-        known |= options_of(command)
-        if isinstance(command, click.Group):
-            ctx = click.Context(command)
-            waiting += [command.get_command(ctx, name) for name in command.list_commands(ctx)]
-    return known
+def commands(command=cli, name=""):
+    """Yield every command, groups too, with its name."""
+    yield name, command
+    if isinstance(command, click.Group):
+        for part in command.list_commands(click.Context(command)):
+            yield from commands(command.get_command(click.Context(command), part), f"{name} {part}".strip())
 
 
 def unknown_names(text):
     """Commands and options that a page names, in blocks or inline, and that the command line does not have."""
     wrong = []
-    known = all_options()
+    known = {option for _, command in commands() for option in options_of(command)}
     lines = [command for block in blocks(text) if block.language == "bash" for command, _ in block.commands()]
     for code in [*INLINE.findall(prose(text)), *lines]:
         words = code.split()
