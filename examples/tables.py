@@ -80,7 +80,7 @@ def worn_table() -> Iterator[str]:
             reported = [row for row in rows if float(row["score"]) >= NEEDED]
             right = [float(row["seconds"]) for row in reported if row["right"] == "1"]
             wrong += len(reported) - len(right)
-            cells += [f"{len(right)} of {len(rows)}", "{:.2f} / {:.1f}".format(*np.percentile(right, (50, 95)))]
+            cells += [f"{len(right)} of {len(rows)}", "{:.2f} / {:.1f}".format(*np.nanpercentile(right, (50, 95)))]
         yield f"| {name} | {' | '.join(cells)} | {wrong} |"
 
 

@@ -321,7 +321,7 @@ def kind_table(rows: Sequence[Row], least: float, margin: float) -> list[list[st
             mine = [r for r in some if r.worn == worn]
             cells.append(f"{sum(r.reported(least, margin) for r in mine)} of {len(mine)}")
         highest = "" if kind == "there" else f"{max(r.score for r in some):.1f}"
-        spent = np.quantile([r.seconds for r in some], [0.5, 0.95])
+        spent = np.nanquantile([r.seconds for r in some], [0.5, 0.95])
         table.append([kind, *cells, highest, f"{spent[0]:.2f} / {spent[1]:.2f}"])
     return table
 
