@@ -18,41 +18,18 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import USUAL_FOCAL, USUAL_SIGMA
-from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
+from roadgeo.matching.refinement import NO_PAIRS, NOT_HELD, Equations, RefineOptions
 from roadgeo.matching.scene import Scene
 
-__all__ = ["FEWEST", "MIN_COS", "FilterOptions", "Pose", "correct", "predict", "start"]
+__all__ = ["FEWEST", "Pose", "correct", "predict", "start"]
 
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
-#: With fewer road points on roads a frame is not corrected; roads count that run the point's way, within this angle.
-FEWEST, MIN_COS = 20, math.cos(math.radians(25.0))
-
-
-@dataclass(frozen=True)
-class FilterOptions:
-    """How motion and roads are weighed.
-
-    Attributes
-    ----------
-    sigma_m, sigma_px : float
-        Standard deviation of a road point across the road: the map's and the mask's.
-    correlation_m : float
-        Errors of the map and of the mask keep their sign over about this length of road.
-    radii : tuple of (float, float)
-        Search radius of each step of the adjustment in metres, and in standard deviations of the
-        prediction, away; the lesser of the two counts.
-    least_radius_m : float
-        They are always searched within this radius.
-    """
-
-    sigma_m: float = 1.2
-    sigma_px: float = 0.9
-    correlation_m: float = 30.0
-    radii: tuple[tuple[float, float], ...] = ((25.0, 3.0), (18.0, 2.5), (12.0, 2.0), (8.0, 1.5), (6.0, 1.5))
-    least_radius_m: float = 5.0
+#: With fewer road points on roads a frame is not corrected. All points take part whose place is this sure: no frame is
+#: false in part.
+FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(60.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -228,54 +205,19 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
     return skews[:, 0], (skews[:, 1:10] - skews[:, 10:]) / 2e-6
 
 
-def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
+def correct(pose: Pose, scene: Scene, roads: RoadBuckets) -> Pose | None:
     """Lay a frame's roads on the map's, starting from a predicted pose; None where there are too few."""
-    local, gsd = _Local.of(pose), pose.gsd_m
-    p = local.parameters(pose.corners)
-    corners = local.corners
-    before = pose.covariance[:8, :8]
-    weight = np.linalg.inv(before)
-    sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
-    spacing = scene.road_length_px * gsd / max(len(scene.points), 1)
-    share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
-    unsure = float(pose.corner_sigma_m.mean())
-    for most_m, deviations in options.radii:
-        radius = max(min(most_m, deviations * unsure), options.least_radius_m)
-        normal, right, met = _road_equations(local, p, scene, radius, max(sigma, radius / 3.0), roads)
-        if met < FEWEST:
-            return None
-        jacobian = local.derivative(p, corners)
-        scale = share * (local.unit / sigma) ** 2
-        pulled = (pose.corners - local.places(p, corners)).ravel()
-        step = np.linalg.solve(
-            scale * normal + jacobian.T @ weight @ jacobian, scale * right + jacobian.T @ weight @ pulled
-        )
-        p = p + step
-        if (np.c_[corners, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any() or not np.isfinite(p).all():
-            return None
-    jacobian = local.derivative(p, corners)
-    information = scale * normal + jacobian.T @ weight @ jacobian
-    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
+    start, before = pose.homography.matrix @ PIXEL_TO_PLANE, pose.covariance[:8, :8]
+    refined = Equations(start / start[2, 2], scene, roads, _REFINEMENT, known=before).adjust(NO_PAIRS, NOT_HELD)
+    if refined is None or refined.share * len(scene.points) < FEWEST:
+        return None
+    corners = Homography(refined.matrix).facing(scene.center)(scene.corners)
+    if not np.isfinite(corners).all():
+        return None
     # The focal length follows the corners as far as it depended on them.
-    placed, follows = local.places(p, corners), pose.covariance[8, :8] @ weight
+    follows = np.linalg.solve(before, pose.covariance[:8, 8])
     both = np.vstack((np.eye(8), follows))
-    joint = both @ covariance @ both.T + np.diag([0.0] * 8 + [pose.covariance[8, 8] - follows @ before @ follows])
-    log_focal = pose.log_focal + float(follows @ (placed - pose.corners).ravel())
-    return Pose(placed, (joint + joint.T) / 2.0, pose.frame, log_focal)
-
-
-def _road_equations(
-    local: _Local, p: FloatArray, scene: Scene, radius: float, sigma: float, roads: RoadBuckets
-) -> tuple[FloatArray, FloatArray, int]:
-    """Return normal (8, 8) and right (8,) sides of normal dp = right, of all points that meet a road, and how many.
-
-    Residuals lie across the roads nearer than `radius` metres, in normalised units, with Cauchy weights by `sigma`.
-    """
-    ways, radii = np.empty((len(scene.points), 3)), np.full(len(scene.points), radius)
-    road_residuals(local.matrix(p), scene.points, scene.directions, radii, MIN_COS, roads, ways)
-    uv = local.query(scene.points)
-    met = np.isfinite(ways[:, 0]) & (1.0 + uv @ p[6:] >= 0.05)
-    away, normals = ways[met, 0], ways[met, 1:]
-    rows = np.einsum("ni,nij->nj", normals, local.derivative(p, uv[met]).reshape(-1, 2, 8)) / local.unit
-    weighted = rows / (1.0 + (away / sigma) ** 2)[:, None]
-    return weighted.T @ rows, weighted.T @ (away / local.unit), int(met.sum())
+    joint = both @ refined.corner_covariance_m2 @ both.T
+    joint[8, 8] += pose.covariance[8, 8] - follows @ before @ follows
+    log_focal = pose.log_focal + float(follows @ (corners - pose.corners).ravel())
+    return Pose(corners, (joint + joint.T) / 2.0, pose.frame, log_focal)

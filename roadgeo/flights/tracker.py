@@ -19,7 +19,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, Look
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
-from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
+from roadgeo.flights.pose import Pose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -199,9 +199,7 @@ class Tracker:
     def _judge(self, waiting: _Waiting, predicted: Pose, known_at: int, status: FrameStatus) -> Tracked:
         frame, scene, reference = waiting.frame, waiting.scene, self._reference
         corrected = (
-            None
-            if scene is None or reference is None
-            else correct(predicted, scene, reference.index.road_buckets, FilterOptions())
+            None if scene is None or reference is None else correct(predicted, scene, reference.index.road_buckets)
         )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
         if corrected is not None and scene is not None and reference is not None:

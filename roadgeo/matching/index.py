@@ -31,6 +31,7 @@ __all__ = [
     "COARSENESS",
     "IndexOptions",
     "ReferenceIndex",
+    "bucket_roads",
     "build_index",
     "crop",
     "neighbour_grid",
@@ -429,6 +430,15 @@ def _of_points(
     }
 
 
+def bucket_roads(segments: Float32Array, grid: tuple[float, float, float], shape: tuple[int, int]) -> RoadBuckets:
+    """List segments (S, 4) by the buckets of a grid."""
+    counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
+    starts, ids = np.cumsum(counts), np.empty(total, np.int32)
+    bin_segments(segments, grid, shape, starts.copy(), ids)
+    return RoadBuckets(segments, starts.astype(np.int32), ids, grid, shape)
+
+
 def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: Say = say_nothing) -> ReferenceIndex:
     """Index a road network.
 
@@ -453,12 +463,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     grid, shape = neighbour_grid(found.xy, options.min_bucket_m)
     segments = _cut_segments(network.graph, options.simplify_m)
     finer = (*grid[:2], grid[2] / _FINER), (_FINER * shape[0], _FINER * shape[1])
-    counts = np.zeros(_FINER**2 * shape[0] * shape[1] + 1, np.int64)
-    total = bin_segments(segments, *finer, counts, np.empty(0, np.int32))
-    segment_starts = np.cumsum(counts).astype(np.int32)
-    segment_ids = np.empty(total, np.int32)
-    bin_segments(segments, *finer, segment_starts.astype(np.int64), segment_ids)
-
+    roads = bucket_roads(segments, *finer)
     say(what, 0.3)
     order, point_starts = sort_by_bucket(found.xy, grid, shape)
     points = found.xy[order], found.branches()[order], found.tangents[order]
@@ -477,8 +482,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     index = ReferenceIndex(
         meta=meta,
         segments=segments,
-        segment_starts=segment_starts,
-        segment_ids=segment_ids,
+        segment_starts=roads.starts,
+        segment_ids=roads.ids,
         source=order,
         **of_points,
     )
