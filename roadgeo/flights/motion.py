@@ -37,10 +37,11 @@ _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 #: Photographs are compared at no more than this side; number of features, and of those that must agree on a homography.
 _IMAGE_SIDE, _FEATURES, _FEWEST_FEATURES = 1000, 2000, 25
 
-#: Masks are compared roughly in about this number of cells a side, their roads this number of cells wide, turned by up
-#: to this angle, and shifted by up to this share of a frame. The best motions are tried: of neighbours, and of frames
-#: in no order, either way up.
-_ROUGH_SIDE, _ROUGH_CELLS, _TURN_DEG, _FARTHEST, _TRIED, _TRIED_ANYHOW = 96, 3.0, 12.0, 0.7, 14, 4
+#: Masks are compared roughly: cells along a side, width of roads in cells, points that vote, greatest turn, and
+#: greatest shift as a share of a frame.
+_ROUGH_SIDE, _ROUGH_CELLS, _ROUGH_POINTS, _TURN_DEG, _FARTHEST = 96, 3.0, 150, 12.0, 0.7
+#: Rough motions that are tried: of neighbours, and of frames in no order, which may lie either way up.
+_TRIED, _TRIED_ANYHOW = 14, 8
 
 #: How far a rough motion may be off: shift in pixels of the rough grid, turn, scale and the rest as shares of a frame.
 _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
@@ -328,7 +329,7 @@ def _rough_motions(first: TracedMask, other: TracedMask, start: FloatArray, coun
     """Return the shifts and turns about a start at which most roads of a mask run on roads of the other."""
     side = max(other.mask.shape)
     cell = side / _ROUGH_SIDE
-    around = LocalSearchOptions(_FARTHEST * side, _TURN_DEG, cell, _ROUGH_CELLS * cell, n_places=count)
+    around = LocalSearchOptions(_FARTHEST * side, _TURN_DEG, cell, _ROUGH_CELLS * cell, _ROUGH_POINTS, count)
     begun = PIXEL_TO_PLANE @ start @ PIXEL_TO_PLANE
     center = Homography(begun)(other.scene.center)
     shifts = search_nearby(begun, other.scene, first.roads, around)

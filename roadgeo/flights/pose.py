@@ -1,9 +1,9 @@
 """Where a frame lies, as the places of its corners with their covariance: predicted by motion, corrected by roads.
 
-An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers
-equivalent to a homography, and the focal length, which all frames share. Measurements are the distances of the frame's
-road points from roads of the map, and that a pinhole with square pixels sees the plane so: motions that are free
-homographies bend the frames, and within a dozen of them they drift four times as far.
+An extended Kalman filter. Its state is a homography, as uncertain as the places of the frame's four corners, and the
+focal length, which all frames share. Measurements are the distances of the frame's road points from roads of the map,
+and that a pinhole with square pixels sees the plane so: motions that are free homographies bend the frames, and within
+a dozen of them they drift four times as far.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import USUAL_FOCAL, USUAL_SIGMA
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.refinement import NO_PAIRS, NOT_HELD, Equations, RefineOptions
+from roadgeo.matching.refinement import NO_PAIRS, NOT_HELD, Equations, RefineOptions, denormalise, normalise
 from roadgeo.matching.scene import Scene
 
 __all__ = ["FEWEST", "Pose", "correct", "predict", "start"]
@@ -27,9 +28,9 @@ __all__ = ["FEWEST", "Pose", "correct", "predict", "start"]
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
-#: With fewer road points on roads a frame is not corrected. All points take part whose place is this sure: no frame is
-#: false in part.
-FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(60.0, 0.0))
+#: With fewer road points on roads a frame is not corrected. All points take part, however unsure their places are: the
+#: fit does not grow from a part of the frame, for all of it was predicted.
+FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(math.inf, 0.0))
 
 
 @dataclass(frozen=True)
@@ -38,25 +39,29 @@ class Pose:
 
     Attributes
     ----------
-    corners : (4, 2) float64
-        TL, TR, BR, BL on the reference plane, metres.
+    matrix : (3, 3) float64
+        Query plane to reference plane, metres.
     covariance : (9, 9) float64
-        Covariance of the corners x0 y0 x1 y1 ..., metres, and of `log_focal`.
+        Covariance of where it puts the corners, x0 y0 x1 y1 ..., metres, and of `log_focal`.
     frame : Frame
     log_focal : float
         Log of the focal length in halves of the frame's diagonal.
     """
 
-    corners: FloatArray
+    matrix: FloatArray
     covariance: FloatArray
     frame: Frame
     log_focal: float
 
     @property
     def homography(self) -> Homography:
-        """Pixel (column, row) to the reference plane."""
-        local = _Local.of(self)
-        return Homography(local.matrix(local.parameters(self.corners)) @ PIXEL_TO_PLANE)
+        """Pixel to the reference plane."""
+        return Homography(self.matrix @ PIXEL_TO_PLANE)
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) TL, TR, BR, BL on the reference plane, metres."""
+        return self.homography(self.frame.corners)
 
     @property
     def center(self) -> FloatArray:
@@ -66,12 +71,12 @@ class Pose:
     @property
     def gsd_m(self) -> float:
         """Metres per pixel in the middle of the frame."""
-        return math.sqrt(abs(float(np.linalg.det(self.homography.jacobian(self.frame.center)))))
+        return math.sqrt(abs(self.homography.area_scale(*self.frame.center.tolist())))
 
     @property
     def sigma_m(self) -> float:
         """Standard deviation of the middle's place: root mean square of its distance from the truth."""
-        row = _rows(_Local.of(self), self.corners, np.zeros((1, 2)))
+        row = _Local.of(self).by_corners(np.zeros((1, 2)))
         return math.sqrt(float(np.trace(row @ self.covariance[:8, :8] @ row.T)))
 
     @property
@@ -89,60 +94,50 @@ def loosened(pose: Pose, shift_m: float) -> Pose:
 
 @dataclass(frozen=True)
 class _Local:
-    """Normalised coordinates: of a frame, (0, 0) is its middle; of the plane, `origin`, in units of `unit` metres."""
+    """A pose's homography in normalised coordinates (see `matching.refinement.normalise`): p (8,), origin and unit."""
 
     frame: Frame
+    p: FloatArray
     origin: FloatArray
     unit: float
 
     @classmethod
     def of(cls, pose: Pose) -> _Local:
-        diagonals = np.hypot(*(pose.corners[2:] - pose.corners[:2]).T)
-        return cls(pose.frame, pose.corners.mean(axis=0), float(diagonals.mean()) / 2.0)
+        return cls(pose.frame, *normalise(pose.matrix, pose.frame.plane_center, pose.frame.half_diagonal))
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Query plane to reference plane."""
+        return denormalise(self.p, self.frame.plane_center, self.frame.half_diagonal, self.origin, self.unit)
 
     @property
     def corners(self) -> FloatArray:
-        """(4, 2) the frame's corners, y up."""
-        return self.query(self.frame.plane_corners)
+        """(4, 2) the frame's corners, normalised."""
+        return self.query(self.frame.corners)
 
-    def query(self, xy: FloatArray) -> FloatArray:
-        """Take (..., 2) points of the query plane to normalised ones."""
-        return np.asarray((xy - self.frame.plane_center) / self.frame.half_diagonal)
+    def query(self, pixels: FloatArray) -> FloatArray:
+        """Normalise pixels (N, 2)."""
+        return np.asarray((pixels - self.frame.center) * (1.0, -1.0) / self.frame.half_diagonal)
 
-    def parameters(self, corners: FloatArray) -> FloatArray:
-        """Return p (8,) of the map that takes the frame's corners to these (4, 2), metres."""
-        uv, xy = self.corners, (corners - self.origin) / self.unit
-        system = np.zeros((8, 8))
-        system[0::2, 0:2], system[0::2, 2] = uv, 1.0
-        system[1::2, 3:5], system[1::2, 5] = uv, 1.0
-        system[0::2, 6:], system[1::2, 6:] = -xy[:, :1] * uv, -xy[:, 1:] * uv
-        return np.asarray(np.linalg.solve(system, xy.ravel()))
+    def sees(self, uv: FloatArray) -> bool:
+        """Whether normalised points (N, 2) lie clearly below the horizon."""
+        return bool((1.0 + uv @ self.p[6:] >= 0.05).all())
 
-    def places(self, p: FloatArray, uv: FloatArray) -> FloatArray:
-        """Return where p puts (N, 2) normalised points, metres."""
-        return np.asarray(self.origin + self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv))
+    def derivative(self, uv: FloatArray) -> FloatArray:
+        """Return the derivative (2N, 8) of places of normalised points, metres, by p."""
+        return np.asarray(self.unit * Homography(np.append(self.p, 1.0).reshape(3, 3)).by_elements(uv).reshape(-1, 8))
 
-    def matrix(self, p: FloatArray) -> FloatArray:
-        """Return p as a map from the query plane, pixels, to the reference plane, metres; w is 1 in the middle."""
-        half, (x, y) = self.frame.half_diagonal, self.frame.plane_center
-        from_query = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, half]]) / half
-        to_plane = np.array([[self.unit, 0.0, self.origin[0]], [0.0, self.unit, self.origin[1]], [0.0, 0.0, 1.0]])
-        return np.asarray(to_plane @ np.append(p, 1.0).reshape(3, 3) @ from_query)
-
-    def derivative(self, p: FloatArray, uv: FloatArray) -> FloatArray:
-        """Return the derivative (2N, 8) of places, metres, by p."""
-        return np.asarray(self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).by_elements(uv).reshape(-1, 8))
-
-
-def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return the derivative (2N, 8) of places of normalised points by the places of the frame's corners."""
-    p = local.parameters(corners)
-    return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
+    def by_corners(self, uv: FloatArray) -> FloatArray:
+        """Return the derivative (2N, 8) of places of normalised points by the places of the frame's corners."""
+        return np.asarray(self.derivative(uv) @ np.linalg.inv(self.derivative(self.corners)))
 
 
 def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> Pose:
     """Return the pose of a frame whose corners (4, 2) are known, with their covariance (8, 8), and of a usual lens."""
-    return Pose(corners, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
+    middle = corners.mean(axis=0)
+    there = (corners - middle).astype(np.float32)  # eastings and northings are large numbers
+    matrix = shift(*middle) @ cv2.getPerspectiveTransform(frame.plane_corners.astype(np.float32), there)
+    return Pose(matrix, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
 
 
 def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
@@ -155,18 +150,14 @@ def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
     sigma_px : float
         Standard deviation of where the motion puts a corner.
     """
-    local = _Local.of(pose)
-    seen = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
-    if not np.isfinite(seen).all():
+    local, motion = _Local.of(pose), Homography(motion).facing(pose.frame.center).matrix
+    seen = local.query(Homography(motion)(pose.frame.corners))
+    if not local.sees(seen):  # NaN neither
         return None
-    uv = local.query(seen * (1.0, -1.0))
-    p = local.parameters(pose.corners)
-    if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
-        return None
-    move = _beside_focal(_rows(local, pose.corners, uv))
+    move = _beside_focal(local.by_corners(seen))
     noise = np.diag([(pose.gsd_m * sigma_px) ** 2 / 2.0] * 8 + [_REFOCUSING**2])
-    moved = replace(pose, corners=local.places(p, uv), covariance=move @ pose.covariance @ move.T + noise)
-    return _as_cameras_see(moved)
+    matrix, covariance = pose.homography.matrix @ motion @ PIXEL_TO_PLANE, move @ pose.covariance @ move.T + noise
+    return _as_cameras_see(replace(pose, matrix=matrix, covariance=covariance))
 
 
 def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
@@ -177,23 +168,23 @@ def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
 def _as_cameras_see(pose: Pose) -> Pose:
     """Correct a pose by a measurement: both skews of a pinhole, of a focal length that is unknown too, are 0."""
     local = _Local.of(pose)
-    corners, p = local.corners, local.parameters(pose.corners)
-    to_state = _beside_focal(np.asarray(np.linalg.inv(local.derivative(p, corners)), float))
+    to_state = np.linalg.inv(_beside_focal(local.derivative(local.corners)))
     spread = to_state @ pose.covariance @ to_state.T
-    given = state = np.append(p, pose.log_focal)
+    given = state = np.append(local.p, pose.log_focal)
     for _ in range(3):
         off, rows = _skews(state)
         gain = np.linalg.solve(rows @ spread @ rows.T + _SKEW**2 * np.eye(2), rows @ spread).T
         state = given - gain @ (off + rows @ (given - state))
-    if not np.isfinite(state).all() or (np.c_[corners, np.ones(4)] @ np.append(state[6:8], 1.0) < 0.05).any():
+    seen = replace(local, p=state[:8])
+    if not np.isfinite(state).all() or not seen.sees(local.corners):
         return pose
-    back = _beside_focal(local.derivative(state[:8], corners))
+    back = _beside_focal(seen.derivative(local.corners))
     covariance = back @ (spread - gain @ rows @ spread) @ back.T
-    return Pose(local.places(state[:8], corners), (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
+    return Pose(seen.matrix, (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
 
 
 def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return both skews (2,) of a state, parameters of `_Local` and log of the focal length, and derivatives (2, 9).
+    """Return both skews (2,) of a state, p of `_Local` and log of the focal length, and derivatives (2, 9).
 
     Two unit vectors on the plane are perpendicular and equally long; how far a camera sees them from that.
     """
@@ -207,17 +198,17 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def correct(pose: Pose, scene: Scene, roads: RoadBuckets) -> Pose | None:
     """Lay a frame's roads on the map's, starting from a predicted pose; None where there are too few."""
-    start, before = pose.homography.matrix @ PIXEL_TO_PLANE, pose.covariance[:8, :8]
-    refined = Equations(start / start[2, 2], scene, roads, _REFINEMENT, known=before).adjust(NO_PAIRS, NOT_HELD)
+    begun, before = pose.matrix / pose.matrix[2, 2], pose.covariance[:8, :8]
+    refined = Equations(begun, scene, roads, _REFINEMENT, known=before).adjust(NO_PAIRS, NOT_HELD)
     if refined is None or refined.share * len(scene.points) < FEWEST:
         return None
-    corners = Homography(refined.matrix).facing(scene.center)(scene.corners)
-    if not np.isfinite(corners).all():
+    placed = replace(pose, matrix=Homography(refined.matrix).facing(scene.center).matrix)
+    if not np.isfinite(placed.corners).all():
         return None
     # The focal length follows the corners as far as it depended on them.
     follows = np.linalg.solve(before, pose.covariance[:8, 8])
     both = np.vstack((np.eye(8), follows))
     joint = both @ refined.corner_covariance_m2 @ both.T
     joint[8, 8] += pose.covariance[8, 8] - follows @ before @ follows
-    log_focal = pose.log_focal + float(follows @ (corners - pose.corners).ravel())
-    return Pose(corners, (joint + joint.T) / 2.0, pose.frame, log_focal)
+    log_focal = pose.log_focal + float(follows @ (placed.corners - pose.corners).ravel())
+    return replace(placed, covariance=(joint + joint.T) / 2.0, log_focal=log_focal)

@@ -20,7 +20,7 @@ from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, Look
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
 from roadgeo.flights.pose import Pose, correct, loosened, predict, start
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -268,7 +268,7 @@ class Tracker:
         """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape
-        shrunk = [_scale(matrix, Frame(width, height)) for matrix in mosaic.to_mosaic]
+        shrunk = [sampling(matrix @ PIXEL_TO_PLANE, (width, height)) for matrix in mosaic.to_mosaic]
         if camera.gsd_m != CameraOptions().gsd_m:
             camera = replace(camera, gsd_m=(camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)))
         camera = replace(camera, focal_px=None)  # a mosaic is no picture by one camera
@@ -371,15 +371,9 @@ def _read(mosaic: Mosaic) -> Query | None:
         return None
 
 
-def _scale(matrix: FloatArray, frame: Frame) -> float:
-    """Return how many pixels of a mosaic a frame's pixel is wide, in its middle."""
-    return math.sqrt(abs(float(np.linalg.det(Homography(matrix).jacobian(frame.center)))))
-
-
 def _odds(pose: Pose, scene: Scene, reference: Reference) -> float:
     """Return the log10 odds of a frame at its place against places nearby."""
-    matrix = pose.homography.matrix @ PIXEL_TO_PLANE
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
     # rival: shifts that meet whole blocks are left out.
     evidence = Evidence(scene, reference.index, pose.gsd_m)
-    return evidence.weigh(matrix) - max(evidence.nearby(matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)
+    return evidence.weigh(pose.matrix) - max(evidence.nearby(pose.matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)
