@@ -6,6 +6,7 @@ Memory holds two frames at a time. The motion of a frame comes from a file, from
 from __future__ import annotations
 
 import logging
+import math
 import tempfile
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -84,7 +85,7 @@ class _Last:
     mask: RoadMask | None = None
     grey: AnyArray | None = None
     odometer: Odometer = field(default_factory=Odometer)
-    scale: dict[str, float] = field(default_factory=dict)
+    scale: float | None = None
     has_photographs: bool = False
 
 
@@ -240,16 +241,14 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
     reading = options.reading
     network = load_model(*reading.segmenters[:1], class_name=reading.class_name, threads=reading.threads)
     with open_photograph(image.path, reading.bands) as photograph:
-        if "scale" not in last.scale:
+        if last.scale is None:
             known = options.gsd_m
-            scale = (
-                next(iter(rank_scales(photograph, network)))
-                if known is None
-                else scale_of(float(np.sqrt(np.prod(known))), network)
+            ways = (
+                rank_scales(photograph, network) if known is None else [scale_of(math.sqrt(math.prod(known)), network)]
             )
-            last.scale["scale"] = scale
+            last.scale = next(iter(ways))
         shape = photograph.height, photograph.width
-        seen = segment(photograph, network, last.scale["scale"]).resized(shape)
+        seen = segment(photograph, network, last.scale).resized(shape)
         rgb, _ = photograph.read(0.0, 0.0, float(photograph.width), float(photograph.height), shape)
     try:
         mask = seen.mask(seen.threshold if reading.threshold is None else reading.threshold)
