@@ -30,7 +30,7 @@ __all__ = ["FEWEST", "Pose", "correct", "predict", "start"]
 _SKEW, _REFOCUSING = 0.005, 0.002
 #: With fewer road points on roads a frame is not corrected. All points take part, however unsure their places are: the
 #: fit does not grow from a part of the frame, for all of it was predicted.
-FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(math.inf, 0.0))
+FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(math.inf, 0.0), correlation_m=30.0)
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,6 @@ _SIGMA_M, _SIGMA_PX = 1.2, 0.9
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
-#: Errors of the map and of the mask are correlated over about this length of road, metres: closer points are not
-#: independent observations.
-_CORRELATION_M = 60.0
 #: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
 #: greater, they keep their sign as much further. Fitted to the corners of training masks.
 _USUAL_RMS = 0.7
@@ -77,11 +74,15 @@ class RefineOptions:
         A cell of the frame takes part when at least this share of its road points meet roads.
     max_radius : (float, float)
         Points whose place is less sure than a third of the sum of metres and pixels do not take part yet.
+    correlation_m : float
+        Errors of the map and of the mask are correlated over about this length of road: closer points are not
+        independent observations.
     """
 
     perspective_sigma: float = 0.5
     least_share: float = 0.5
     max_radius: tuple[float, float] = (20.0, 10.0)
+    correlation_m: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ class Equations:
             by_p, mean = self._corners_by_p(), self.p.copy()
             self.prior[:8, :8] = self.sigma_m**2 * by_p.T @ np.linalg.inv(known) @ by_p
         spacing_m = scene.road_length_px * gsd / max(len(scene.points), 1)
-        self.weight = min(1.0, spacing_m * step / _CORRELATION_M)
+        self.weight = min(1.0, spacing_m * step / options.correlation_m)
         xy, along, cells = _samples(scene, step)
         half_side = max(scene.size) / 2.0 / scene.half_size
         self.samples = RoadSamples(xy, along, cells, self.weight, half_side)
