@@ -295,9 +295,13 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
 
 
 def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
-    """Columns of names and kinds of the streets; text, or NULL."""
+    """Columns of names and kinds of the streets as far as any are known; text, or NULL."""
     known = {"name": network.names, "highway": network.kinds}
-    return {key: [text or None for text in column.tolist()] for key, column in known.items() if column is not None}
+    return {
+        key: [text or None for text in column.tolist()]
+        for key, column in known.items()
+        if column is not None and any(column)
+    }
 
 
 def _tangent_layer(found: Intersections, plane: LocalPlane) -> Layer:

@@ -46,8 +46,8 @@ class Spool:
         self.folder, self.size = folder, size
         self.n_segments: dict[Cell, int] = defaultdict(int)
 
-    def add(self, lines: AnyArray, labels: AnyArray | None = None) -> None:
-        """Store (L,) LineStrings, and the name and kind of each, (L, 2) text, as far as they are known.
+    def add(self, lines: AnyArray, labels: AnyArray) -> None:
+        """Store (L,) LineStrings, and the name and kind of each, (L, 2) text.
 
         Raises
         ------
@@ -63,7 +63,6 @@ class Spool:
         begins = np.floor(coords[np.flatnonzero(owner[1:] == owner[:-1])] / self.size).astype(np.int64)
         for (x, y), n in zip(*np.unique(begins, axis=0, return_counts=True), strict=True):
             self.n_segments[int(x), int(y)] += int(n)
-        labels = np.full((len(lines), 2), "", object) if labels is None else labels
         columns, target = [np.arange(len(lines)), *labels.T], self.folder / f"{len(self._parts()):06}.fgb"
         form = {"driver": "FlatGeobuf", "geometry_type": "LineString", "crs": None}
         try:

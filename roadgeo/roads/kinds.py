@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+from collections.abc import Callable
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -59,8 +58,8 @@ def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
     Parameters
     ----------
     values : (L,) object
-        Values of `highway`: text, several in a list or in text (`"['a', 'b']"`, `a;b`), or None. Among several, one is
-        enough. Lines without a value are roads of an unknown kind: all kinds but "main" take them.
+        Values of `highway`: text, several with semicolons between them, of which one is enough. Lines without a value,
+        "", are roads of an unknown kind: all kinds but "main" take them.
     kind : RoadKind
 
     Returns
@@ -77,30 +76,16 @@ def main_ranks(values: AnyArray) -> IntArray:
     """Return (L,) the rank of each line among main roads, by values of `highway`: 0 for motorways; -1: no main road."""
     ranks = np.full(len(values), -1)
     for rank, name in reversed(list(enumerate(MAIN_CLASSES))):
-        ranks[_each(values, lambda names, name=name: bool(names & {name, f"{name}_link"}))] = rank
+        ranks[~_each(values, {name, f"{name}_link"}.isdisjoint)] = rank
     return ranks
 
 
 def in_tunnel(values: AnyArray) -> BoolArray:
-    """Return which lines run in a tunnel all the way, by values of `tunnel`, as in `drives`; (L,) bool."""
+    """Return which lines run in a tunnel all the way, by values of `tunnel`, lower case, as in `drives`; (L,) bool."""
     return _each(values, lambda names: bool(names) and names <= _TUNNELS)
 
 
-def _each(values: AnyArray, test: Any) -> BoolArray:
+def _each(values: AnyArray, test: Callable[[set[str]], bool]) -> BoolArray:
     """Apply a test of a set of names to every value; equal values are tested once."""
-    tested = cache(lambda key: test(_names(key)))
-    return np.array([tested(_key(value)) for value in values], bool)
-
-
-def _key(value: Any) -> Any:
-    """Return a value, of several a tuple of texts, as something that can be looked up."""
-    item = value.item() if isinstance(value, np.generic) else value
-    return tuple(map(str, item)) if isinstance(item, Iterable) and not isinstance(item, str) else item
-
-
-def _names(value: Any) -> set[str]:
-    """Split one value into its names."""
-    if value is None or (isinstance(value, float) and value != value):
-        return set()
-    text = ";".join(value) if isinstance(value, tuple) else str(value)
-    return {name for name in re.split(r"[^a-z0-9_]+", text.lower()) if name}
+    tested = cache(lambda text: test(set(text.split(";")) - {""}))
+    return np.array([tested(value) for value in values], bool)

@@ -41,7 +41,7 @@ from roadgeo.roads.network import build_network
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines, add_counts
 from roadgeo.sources.overpass import box_area
-from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, with_crs
+from roadgeo.sources.roads import Box, choose_lines, join_roads, with_crs
 from roadgeo.sources.streams import list_sources, stream_lines, tell_source
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import write_bytes, writing
@@ -229,7 +229,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
             if chosen.crs != crs and crs != "EPSG:4326":
                 return None
             with writing(folder):
-                spool.add(_to(chosen, str(crs)), _labels(chosen))
+                spool.add(_to(chosen, str(crs)), np.stack([chosen.name, chosen.highway], axis=1))
         tell_source(file.name, counts)
         sources.append(counts)
     calls = dict.fromkeys(source["attribution"] for source in sources if source.get("attribution"))
@@ -250,14 +250,6 @@ def _to(lines: RoadLines, crs: str) -> Any:
     if lines.crs == crs:
         return lines.lines
     return shapely.transform(lines.lines, lambda xy: transform(str(lines.crs), crs, xy))
-
-
-def _labels(lines: RoadLines) -> Any:
-    """Return the name and the kind of each line, (L, 2) text; None where nothing is known."""
-    columns = [as_text([column], [lines]) for column in (lines.name, lines.highway)]
-    if all(column is None for column in columns):
-        return None
-    return np.stack([np.full(len(lines.lines), "", object) if column is None else column for column in columns], axis=1)
 
 
 def _metres(crs: str) -> float | None:
@@ -333,8 +325,9 @@ class ShardWork:
         entry = ShardEntry(box.name, bounds_in_degrees(box.core, crs), bounds_in_degrees(reach, crs))
         lines, labels = spool.read(reach) if box.name != _COARSE else _main_roads(spool, entry.ground)
         if len(lines):
-            names, kinds = labels.T if (labels != "").any() else (None, None)
-            entry = self._build_reference(entry, RoadLines(lines, crs, kinds, meta={"name": box.name}, name=names), box)
+            names, kinds = labels.T
+            held = RoadLines(lines, crs, kinds, names, np.zeros(len(lines), bool), True, {"name": box.name})
+            entry = self._build_reference(entry, held, box)
         write_bytes(done, json.dumps(asdict(entry)).encode())  # last: the files that it lists exist
         return entry
 

@@ -17,6 +17,9 @@ __all__ = [
 
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
+#: Attributes of `RoadLines` with a value for each line.
+_COLUMNS = ("lines", "highway", "name", "tunnel")
+
 
 @dataclass(frozen=True)
 class RoadTable:
@@ -50,52 +53,41 @@ class RoadLines:
         Shapely LineStrings, 2-D, finite, not empty, in the source's CRS.
     crs : str or None
         "EPSG:n" or WKT; None where the source has none.
-    highway : (L,) object or None
-        Kind of each road, in OpenStreetMap's words (`highway`), or None; None where the source has no kinds.
-    tunnel : (L,) bool or None
+    highway, name : (L,) object
+        Text, "" where it is not known: the kind of each road in OpenStreetMap's words, and its street, for display.
+    tunnel : (L,) bool
         Runs in a tunnel.
+    kinds_known : bool
+        Whether the source has kinds of roads at all.
     meta : dict
         Provenance: plain values.
-    name : (L,) object or None
-        Names of the streets, text or None; for display.
     areas : (A,) object
         Polygons that may be roads drawn as surfaces.
     """
 
     lines: AnyArray
     crs: str | None
-    highway: AnyArray | None = None
-    tunnel: BoolArray | None = None
+    highway: AnyArray
+    name: AnyArray
+    tunnel: BoolArray
+    kinds_known: bool
     meta: dict[str, Any] = field(default_factory=dict)
-    name: AnyArray | None = None
     areas: AnyArray = field(default_factory=lambda: np.empty(0, object))
 
     def take(self, rows: IntArray | BoolArray) -> RoadLines:
         """Return some of the lines."""
-        highway, tunnel, name = (
-            None if column is None else column[rows] for column in (self.highway, self.tunnel, self.name)
-        )
-        return replace(self, lines=self.lines[rows], highway=highway, tunnel=tunnel, name=name)
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
 
 def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
     """Put parts of one source together: counts in `meta` are added up, and where parts differ in CRS they must not."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
     meta: dict[str, Any] = {}
     for part in parts:
         add_counts(meta, part.meta)
-
-    def column(name: str) -> AnyArray | None:
-        if all(getattr(part, name) is None for part in parts):
-            return None
-        empty = False if name == "tunnel" else None
-        columns = [(getattr(part, name), len(part.lines)) for part in parts]
-        return np.concatenate([np.full(n, empty) if item is None else item for item, n in columns])
-
-    lines, areas = (np.concatenate([getattr(part, name) for part in parts]) for name in ("lines", "areas"))
-    return RoadLines(lines, first.crs, column("highway"), column("tunnel"), meta, column("name"), areas)
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_COLUMNS, "areas")
+    }
+    return replace(parts[0], **columns, meta=meta, kinds_known=any(part.kinds_known for part in parts))
 
 
 def add_counts(meta: dict[str, Any], part: dict[str, Any]) -> None:

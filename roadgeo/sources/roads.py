@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +22,14 @@ from roadgeo.errors import CrsError, NoRoadsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, to_plane
 from roadgeo.roads.kinds import RoadKind, drives
 from roadgeo.sources.containers import held_table
-from roadgeo.sources.lines import RoadLines, cut_lines, objects
+from roadgeo.sources.lines import RoadLines, cut_lines
 from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
 from roadgeo.sources.schemas import recognise
 from roadgeo.sources.streams import EXCHANGED, list_sources, read_lines, tell_source
 from roadgeo.storage.crs import known_crs, name_crs
 
 __all__ = [
-    *("Box", "Roads", "as_text", "choose_lines", "choose_roads", "fetch_roads", "join_roads", "read_roads", "with_crs"),
+    *("Box", "Roads", "choose_lines", "choose_roads", "fetch_roads", "join_roads", "read_roads", "with_crs"),
 ]
 
 _LOG = logging.getLogger(__name__)
@@ -254,20 +254,20 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
     """Keep the lines that were asked for, and count what was left out; they are cut at the border of an area."""
     import shapely
 
-    wanted = np.ones(len(source.lines), bool) if source.highway is None else drives(source.highway, which)
-    hidden = np.zeros(len(wanted), bool) if tunnels or source.tunnel is None else source.tunnel & wanted
+    wanted = drives(source.highway, which) if source.kinds_known else np.ones(len(source.lines), bool)
+    hidden = source.tunnel & wanted & (not tunnels)
     chosen = source.take(wanted & ~hidden)
     astray = _astray(chosen, name)
     chosen = chosen.take(~astray)
     if area is not None:
         lines, place = cut_lines(shapely.transform(chosen.lines, lambda xy: to_lonlat(str(source.crs), xy)), area)
         chosen = replace(chosen.take(place), lines=lines, crs="EPSG:4326")
-    kindless = 0 if chosen.highway is None else sum(kind is None for kind in chosen.highway)
+    kindless = int((chosen.highway == "").sum()) * source.kinds_known
     meta = {
         "name": name,
         **source.meta,
         "lines": len(source.lines),
-        "kinds_known": source.highway is not None or which == "all",
+        "kinds_known": source.kinds_known or which == "all",
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
         **({"exchanged": True} if _are_exchanged(chosen) else {}),
@@ -275,7 +275,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
         **({"without_kind": kindless} if kindless else {}),
         "kept": len(chosen.lines),
     }
-    return replace(chosen, tunnel=None, meta=meta)
+    return replace(chosen, meta=meta)
 
 
 def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
@@ -283,8 +283,6 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
     filled = [source for source in sources if len(source.lines)]
     if not filled:
         raise _no_roads(sources)
-    names = as_text([source.name for source in filled], filled)
-    kinds = as_text([source.highway for source in filled], filled)
     shared = {source.crs for source in filled}
     own_crs = shared.pop() if len(shared) == 1 else None
     plane = choose_plane(np.concatenate([_corners(source) for source in filled]), own_crs)
@@ -298,19 +296,8 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
-        names,
-        kinds,
-    )
-
-
-def as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) -> AnyArray | None:
-    """Join columns to (L,) text, "" where nothing is known; None where no source knows any."""
-    if all(column is None for column in columns):
-        return None
-    held = [np.full(len(source.lines), None) if c is None else c for c, source in zip(columns, sources, strict=True)]
-    return objects(
-        value if isinstance(value, str) else ";".join(map(str, value)) if isinstance(value, Iterable) else ""
-        for value in np.concatenate(held)
+        np.concatenate([source.name for source in filled]),
+        np.concatenate([source.highway for source in filled]),
     )
 
 

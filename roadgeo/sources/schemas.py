@@ -97,32 +97,31 @@ class Schema:
         lines, place = simple_lines(shapes)
         areas = simple_areas(shapes)
         row = np.flatnonzero(~others)[place]
-        tunnels = [
-            in_tunnel(_each(columns[name], _HIDDEN.get(name, _itself))[row]) for name in _TUNNELS if name in columns
-        ]
-        tunnels += [in_tunnel(_tag(columns[name], "tunnel")[row]) for name in _TAGS if name in columns]
+        hidden = [_each(columns[name], _HIDDEN.get(name, _itself)) for name in _TUNNELS if name in columns]
+        hidden += [_tag(columns[name], "tunnel") for name in _TAGS if name in columns]
+        tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
         called = next((columns[name] for name in _NAMES if name in columns), None)
         counts = {"no_roads": int(others.sum()), "broken": _count_broken(shapes)}
         told = {"attribution": self.attribution, **table.meta, **counts}
         return RoadLines(
             lines,
             crs_name(table.crs),
-            kinds[row] if self.kinds else None,
-            np.logical_or.reduce(tunnels) if tunnels else None,
+            kinds[row],
+            np.full(len(row), "", object) if called is None else _each(called[row], _text),
+            np.logical_or.reduce([np.zeros(len(row), bool), *tunnels]),
+            bool(self.kinds),
             {"features": len(table.shapes)} | {key: value for key, value in told.items() if value},
-            None if called is None else _each(called[row], _text),
             areas,
         )
 
     def _kinds(self, columns: Mapping[str, AnyArray], n: int) -> tuple[AnyArray, BoolArray]:
-        """Return (N,) the kind of each feature, or None, and which are no roads."""
-        kinds, others = np.full(n, None, object), np.zeros(n, bool)
+        """Return (N,) the kind of each feature, "" where it is not known, and which are no roads."""
+        kinds, others = np.full(n, "", object), np.zeros(n, bool)
         for name, words in self.kinds:
             told = _each(columns.get(name, kinds), partial(_kind_of, words=words))
-            better = [had is None or (had == _ROAD and new is not None) for had, new in zip(kinds, told, strict=True)]
-            kinds = np.where(better, told, kinds)
+            kinds = np.where((kinds == "") | ((kinds == _ROAD) & (told != "")), told, kinds)
             others |= told == _NONE
-        unknown = np.array([kind is None for kind in kinds], bool)
+        unknown = kinds == ""
         for name in _OTHER_KEYS:
             others |= unknown & (_each(columns[name], _is_filled).astype(bool) if name in columns else False)
         said = [_tag(columns[name], _AREA) for name in _TAGS if name in columns]
@@ -189,12 +188,12 @@ def _share(values: AnyArray, words: Mapping[str, str]) -> float:
     return known / len(sample) if sample else 0.0
 
 
-def _kind_of(value: Any, words: Mapping[str, str]) -> str | None:
-    """Return the `highway` that a value stands for, several with semicolons between them; None: for none."""
+def _kind_of(value: Any, words: Mapping[str, str]) -> str:
+    """Return the `highway` that a value stands for, several with semicolons between them; "" for none."""
     found = _split(value)
     kinds = dict.fromkeys(_look_up(word, words) or (word if words is _HIGHWAY else None) for word in found)
     roads = [kind for kind in kinds if kind not in (None, _NONE)]
-    return ";".join(map(str, roads)) or (_NONE if _NONE in kinds else None)
+    return ";".join(map(str, roads)) or (_NONE if _NONE in kinds else "")
 
 
 def _look_up(word: str, words: Mapping[str, str]) -> str | None:
@@ -211,6 +210,11 @@ def _split(value: Any) -> list[str]:
     if isinstance(value, tuple | list | np.ndarray | set):
         return [str(one) for one in value]
     return [f"{value:g}" if isinstance(value, float) else str(value)]
+
+
+def _words(value: Any) -> str:
+    """Return the words of a value in lower case, with semicolons between them."""
+    return ";".join(_split(value)).lower()
 
 
 def _is_filled(value: Any) -> bool:
@@ -242,11 +246,11 @@ def _flags(value: Any) -> Any:
     return [str(flag) for flags in found if isinstance(flags, list | tuple | np.ndarray) for flag in flags]
 
 
-def _text(value: Any) -> str | None:
-    """Return the name of a street; of Overture's names the primary one."""
+def _text(value: Any) -> str:
+    """Return the name of a street, "" for none; of Overture's names the primary one."""
     told = _json(value)
     told = told.get("primary") if isinstance(told, dict) else value
-    return ";".join(map(str, told)) if isinstance(told, list | tuple) else str(told) if _is_filled(told) else None
+    return ";".join(map(str, told)) if isinstance(told, list | tuple) else str(told) if _is_filled(told) else ""
 
 
 def _json(value: Any) -> Any:

@@ -102,7 +102,7 @@ def _tells_kinds(file: Path) -> bool:
     first = next(stream_lines(file, most=_LOOK))
     if len(first.lines) == 0:
         raise NoRoadsError("no roads in it")
-    return first.highway is not None
+    return first.kinds_known
 
 
 def read_lines(

@@ -42,28 +42,10 @@ def draw_together(xy, pairs, radius):
     return clusters
 
 
-def reattach(centre, ends, lines):
-    """Polylines from the new place of one end to that of the other, without repeated points there."""
-    result = []
-    for (a, b), line in zip(ends, lines, strict=True):
-        points = [tuple(p) for p in line]
-        points = points if points[0] == tuple(centre[a]) else [tuple(centre[a]), *points]
-        result.append(points if points[-1] == tuple(centre[b]) else [*points, tuple(centre[b])])
-    return result
-
-
 def cut_edge(line, cuts):
     """The pieces of a polyline between arc lengths."""
     whole = LineString(line)
     return [substring(whole, a, b) for a, b in pairwise([0.0, *cuts, whole.length])]
-
-
-def halfway(lines, n):
-    """Mean of polylines, at n points at equal shares of their lengths."""
-    shares = np.linspace(0, 1, n)
-    return np.mean(
-        [[LineString(line).interpolate(s, normalized=True).coords[0] for s in shares] for line in lines], axis=0
-    )
 
 
 def are_twins(first, other, distance):

@@ -10,7 +10,6 @@ import PIL.Image
 import pytest
 import rasterio
 from worlds.rasters import write_raster
-from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.sources.bands import Choice
@@ -260,15 +259,6 @@ def test_a_palette_of_three_greys_is_a_soft_map(tmp_path: Path, roads: np.ndarra
     image.putpalette([10, 10, 10, 250, 250, 250, 120, 120, 120])
     image.save(tmp_path / "grey.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "grey.png").roads, roads)
-
-
-@pytest.mark.parametrize("orientation", range(2, 9))
-@pytest.mark.parametrize("kind", ["jpg", "png", "tif"])
-def test_masks_are_upright(tmp_path: Path, roads: np.ndarray, kind: str, orientation: int) -> None:
-    path = save_turned(tmp_path / f"mask.{kind}", (255 * roads).astype(np.uint8)[:, :-9], orientation)
-    found = read_mask(path).roads
-    assert found.shape == roads[:, :-9].shape
-    assert np.mean(found != roads[:, :-9]) < 0.002
 
 
 def test_strips_join(tmp_path: Path, roads: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

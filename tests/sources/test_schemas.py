@@ -97,13 +97,13 @@ def test_whom_to_name(columns, attribution):
 @pytest.mark.parametrize(
     ("columns", "kinds"),
     [
-        ({"road_kind": ["residential", "footway", None]}, ["residential", "footway", None]),  # a column of any name
+        ({"road_kind": ["residential", "footway", None]}, ["residential", "footway", ""]),  # a column of any name
         ({"surface": ["asphalt", "gravel", "residential"]}, None),
         ({"type": ["A", "B", "residential"]}, None),
         ({"highway": ["something_new", "residential", "residential"]}, ["something_new", "residential", "residential"]),
         ({"highway": ["construction", "residential", "service"]}, ["residential", "service"]),
         ({"highway": ["residential", None, ""], "name": ["a", "b", "c"]}, ["residential"]),
-        ({"highway": ["residential", None, ""], "city": ["a", "b", "c"]}, ["residential", None, None]),  # all are roads
+        ({"highway": ["residential", None, ""], "city": ["a", "b", "c"]}, ["residential", "", ""]),  # all are roads
         ({"railway": ["rail", None, "no"]}, None),
         ({"highway": [None, None, None], "waterway": ["river", None, None]}, []),
         (
@@ -124,8 +124,30 @@ def test_what_tells_the_kind(columns, kinds):
     shapes = column(*(shapely.LineString([(k, 0), (k, 1)]) for k in range(3)))
     made = RoadTable(shapes, None, {name: column(*values) for name, values in columns.items()})
     read = recognise(made).adapt(made)
-    assert (None if read.highway is None else read.highway.tolist()) == kinds
+    assert (read.highway.tolist() if read.kinds_known else None) == kinds
     assert len(read.lines) == (len(kinds) if kinds is not None else 2 if "railway" in columns else 3)
+
+
+@pytest.mark.parametrize(
+    ("value", "tunnel"),
+    [
+        ("yes", True),
+        ("no", False),
+        (None, False),
+        ("building_passage", False),
+        ("T", True),
+        ("F", False),
+        (True, True),
+        (1, True),
+        ("['yes', 'no']", False),
+        (["yes", "yes"], True),
+        ("avalanche_protector", True),
+        ("", False),
+    ],
+)
+def test_tunnels(value, tunnel):
+    made = RoadTable(column(shapely.LineString([(0, 0), (1, 1)])), None, {"tunnel": column(value)})
+    assert recognise(made).adapt(made).tunnel.tolist() == [tunnel]
 
 
 @pytest.mark.parametrize("value", [np.True_, np.int64(3), np.float64("nan"), np.str_("x"), b"primary", 1j, {"a": 1}])
