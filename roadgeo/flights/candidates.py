@@ -15,12 +15,11 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.flights.mosaic import Mosaic
-from roadgeo.geometry.camera import judge
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.location import Location
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.methods import Found, search_references
+from roadgeo.matching.methods import Found, Known, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
@@ -108,9 +107,7 @@ class Candidates:
         """Search the map where that is due; places that were proposed before are among those that the search meets."""
         if not look.searched:
             options = replace(options, match=replace(options.match, sweeps=(), without_roads=(), roads=False))
-        places = [(kept.index, kept.under(look)) for kept in self._kept if kept.seen_at in look.numbers]
-        size, camera = look.query.scene.size, options.match.camera
-        known = [(index, matrix) for index, matrix in places if judge(matrix, size, camera, rough=True) is None]
+        known: list[Known] = [(kept.index, kept.under(look)) for kept in self._kept if kept.seen_at in look.numbers]
         parts = [part for reference in self.references for part in reference.parts]
         found = search_references(look.query, parts, options, options.search.time_limit_s, explained=True, known=known)
         kept = [candidate for result in found for candidate in _proposed(result, look)]

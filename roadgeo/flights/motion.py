@@ -10,7 +10,7 @@ import io
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,15 +19,14 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, RoadSourceError
-from roadgeo.flights.pose import FEWEST, correct, start
+from roadgeo.flights.pose import FEWEST, MIN_COS, FilterOptions, correct, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.mask import RoadMask
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.index import bucket_roads, neighbour_grid
-from roadgeo.matching.scene import MIN_COS, Scene, trace_query
-from roadgeo.matching.shifts import LocalSearchOptions, move_about, search_nearby
+from roadgeo.matching.index import bucket_roads
+from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion"]
@@ -37,16 +36,11 @@ _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 #: Photographs are compared at no more than this side; number of features, and of those that must agree on a homography.
 _IMAGE_SIDE, _FEATURES, _FEWEST_FEATURES = 1000, 2000, 25
 
-#: Masks are compared roughly: cells along a side, width of roads in cells, points that vote, greatest turn, and
-#: greatest shift as a share of a frame.
-_ROUGH_SIDE, _ROUGH_CELLS, _ROUGH_POINTS, _TURN_DEG, _FARTHEST = 96, 3.0, 150, 12.0, 0.7
-#: Rough motions that are tried: of neighbours, and of frames in no order, which may lie either way up.
-_TRIED, _TRIED_ANYHOW = 14, 8
+#: Masks are compared roughly at about this side, turned by these angles, and shifted by up to this share of a frame.
+_ROUGH_SIDE, _TURNS_DEG, _FARTHEST = 96, (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0), 0.7
 
 #: How far a rough motion may be off: shift in pixels of the rough grid, turn, scale and the rest as shares of a frame.
 _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
-#: Side of the buckets in which roads of a mask are looked up.
-_BUCKET_PX = 32.0
 #: The least share of road points in the overlap that must lie on roads of the other mask.
 _LEAST_SHARE = 0.6
 #: Frames in no order are laid on each other where they share this part: less agrees by chance.
@@ -59,6 +53,13 @@ _STEADY, _OTHERWISE = 0.1, 1.28
 _LEAST_AGAIN, _LEAST_FIRST, _LEAD_FIRST = 0.3, 0.55, 0.06
 #: How far off a corner may be put by masks, and by taking the flight to go on as it went; and how often in a row it is.
 _MASKS_PX, _HELD_PX, _MOST_HELD = 12.0, 30.0, 2
+_FILTER = FilterOptions(
+    sigma_m=2.0,
+    sigma_px=1.0,
+    correlation_m=60.0,
+    radii=((40.0, 3.0), (25.0, 2.5), (16.0, 2.0), (10.0, 2.0), (8.0, 1.5), (8.0, 1.5)),
+    least_radius_m=6.0,
+)
 
 
 def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
@@ -151,33 +152,18 @@ class Odometer:
 
 
 class _Laid(NamedTuple):
-    """A mask laid on another: how, the shares of either's roads that agree, and of the frame that both see.
+    """A mask laid on another: how, the share of roads that agree, and of the frame that both see.
 
     Where frames share less, less can disagree: the quality is the agreement, times the root of the shared part.
     """
 
     motion: FloatArray
-    there: float
-    back: float
+    agreement: float
     shared: float
-
-    @property
-    def agreement(self) -> float:
-        return 0.5 * (self.there + self.back)
 
     @property
     def fit(self) -> float:
         return self.agreement * math.sqrt(self.shared)
-
-    @property
-    def overlaps(self) -> bool:
-        """Whether the roads of both agree where they share enough."""
-        return min(self.there, self.back) >= _LEAST_SHARE and self.shared >= _LEAST_SHARED
-
-    @property
-    def sure(self) -> float:
-        """How sure it is that they overlap so."""
-        return min(self.there, self.back) * self.shared
 
     def rivals(self, other: _Laid) -> bool:
         """Whether it fits, or agrees where enough is shared, about as well: streets that repeat do."""
@@ -195,7 +181,7 @@ def between_masks(first: TracedMask, other: TracedMask, last: FloatArray | None 
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    guesses = _rough_motions(first, other, np.eye(3), _TRIED)
+    guesses = _rough_motions(first.mask, other.mask, 2 * len(_TURNS_DEG))
     if last is not None:
         guesses = [last, *(guess for guess in guesses if _otherwise(guess, last, frame) < 2.0 * _STEADY)]
     laid = [found for guess in guesses if (found := _lay(guess, frame, first, other)) is not None]
@@ -224,17 +210,12 @@ def _steadiest(laid: Sequence[_Laid], last: FloatArray, frame: Frame) -> FloatAr
 
 def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Laid | None:
     """Lay a mask on another, near a rough motion; None where they hardly share a road."""
-    corners = Homography(guess).facing(frame.center)(frame.corners)
-    if not np.isfinite(corners).all():
+    found = _refine(guess, frame, other.scene, first.roads)
+    if found is None:
         return None
-    placed = correct(start(corners * (1.0, -1.0), frame, _rough_covariance(frame)), other.scene, first.roads)
-    if placed is None:
-        return None
-    motion = PIXEL_TO_PLANE @ placed.homography.matrix
-    motion = np.asarray(motion / motion[2, 2])
-    there = _agreement(motion, frame, other.scene, first.roads)
+    there, motion = found
     back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, first.scene, other.roads)
-    return _Laid(motion, there, back, _shared(motion, frame))
+    return _Laid(motion, 0.5 * (there + back), _shared(motion, frame))
 
 
 @dataclass(frozen=True)
@@ -268,15 +249,23 @@ def overlay(first: TracedMask, other: TracedMask) -> list[tuple[FloatArray, floa
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    laid: list[_Laid | None] = []
+    found: list[tuple[FloatArray, float]] = []
     for turn in (np.eye(3), _half_turn(frame)):
-        laid += [_lay(guess, frame, first, other) for guess in _rough_motions(first, other, turn, _TRIED_ANYHOW)]
-    overlaps = [found for found in laid if found is not None and found.overlaps]
-    distinct: list[_Laid] = []
-    for found in sorted(overlaps, key=lambda found: -found.sure):
-        if not any(_is_same_motion(found.motion, known.motion, frame) for known in distinct):
-            distinct.append(found)
-    return [(found.motion, found.sure) for found in distinct[:3]]
+        seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
+        for guess in _rough_motions(first.mask, seen, 4):
+            laid = _refine(guess @ turn, frame, other.scene, first.roads)
+            if laid is None or laid[0] < _LEAST_SHARE:
+                continue
+            back = _agreement(np.asarray(np.linalg.inv(laid[1]), float), frame, first.scene, other.roads)
+            shared = _shared(laid[1], frame)
+            if back >= _LEAST_SHARE and shared >= _LEAST_SHARED:
+                found.append((laid[1], min(laid[0], back) * shared))
+    found.sort(key=lambda pair: -pair[1])
+    distinct: list[tuple[FloatArray, float]] = []
+    for motion, sure in found:
+        if not any(_is_same_motion(motion, known, frame) for known, _ in distinct):
+            distinct.append((motion, sure))
+    return distinct[:3]
 
 
 def _is_same_motion(a: FloatArray, b: FloatArray, frame: Frame) -> bool:
@@ -296,6 +285,19 @@ def _otherwise(motion: FloatArray, last: FloatArray, frame: Frame) -> float:
     return float(np.hypot(*(moved - before)) / max(frame.width, frame.height))
 
 
+def _refine(guess: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> tuple[float, FloatArray] | None:
+    """Lay a mask on the roads of the one before, near a rough motion; return how well they agree, and the motion."""
+    corners = Homography(guess).facing(frame.center)(frame.corners)
+    if not np.isfinite(corners).all():
+        return None
+    pose = start(corners * (1.0, -1.0), frame, _rough_covariance(frame))
+    placed = correct(pose, scene, roads, _FILTER)
+    if placed is None:
+        return None
+    motion = np.diag([1.0, -1.0, 1.0]) @ placed.homography.matrix
+    return _agreement(motion, frame, scene, roads), np.asarray(motion / motion[2, 2])
+
+
 def _rough_covariance(frame: Frame) -> FloatArray:
     """Return how unsure a rough motion is: (8, 8) of the corners, which mostly shift, turn and grow together."""
     unit = frame.half_diagonal
@@ -312,7 +314,7 @@ def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBucket
     inside = np.asarray(((pixels > 0) & (pixels < (frame.width, frame.height))).all(axis=1))
     if inside.sum() < 0.1 * len(inside) or inside.sum() < FEWEST:
         return 0.0
-    matrix = PIXEL_TO_PLANE @ motion @ PIXEL_TO_PLANE
+    matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
     points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
     radii, ways = np.full(len(points), 6.0), np.empty((len(points), 3))
     return road_residuals(matrix, points, along, radii, MIN_COS, roads, ways) / len(points)
@@ -322,15 +324,49 @@ def _buckets(graph: RoadGraph) -> RoadBuckets:
     """Sort the roads of a traced mask into buckets, so that they can be looked up like a map's."""
     parts = [np.hstack([line[:-1], line[1:]]) for line in graph.polylines()]
     segments = np.ascontiguousarray(np.concatenate(parts), np.float32)
-    return bucket_roads(segments, *neighbour_grid(segments.reshape(-1, 2).astype(float), _BUCKET_PX))
+    ends = segments.reshape(-1, 2)
+    low, size = ends.min(axis=0), 32.0
+    columns, rows = (int(side / size) + 1 for side in ends.max(axis=0) - low)
+    return bucket_roads(segments, (float(low[0]), float(low[1]), size), (columns, rows))
 
 
-def _rough_motions(first: TracedMask, other: TracedMask, start: FloatArray, count: int) -> list[FloatArray]:
-    """Return the shifts and turns about a start at which most roads of a mask run on roads of the other."""
-    side = max(other.mask.shape)
-    cell = side / _ROUGH_SIDE
-    around = LocalSearchOptions(_FARTHEST * side, _TURN_DEG, cell, _ROUGH_CELLS * cell, _ROUGH_POINTS, count)
-    begun = PIXEL_TO_PLANE @ start @ PIXEL_TO_PLANE
-    center = Homography(begun)(other.scene.center)
-    shifts = search_nearby(begun, other.scene, first.roads, around)
-    return [PIXEL_TO_PLANE @ move_about(center, shift) @ begun @ PIXEL_TO_PLANE for shift in shifts]
+def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[FloatArray]:
+    """Return the shifts at which the roads of two masks cover each other most: the best ones, each of another turn.
+
+    The two best shifts of each turn are among them.
+    """
+    height, width = mask.shape
+    scale = _ROUGH_SIDE / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    grown = (2 * size[1], 2 * size[0])
+    fixed = np.conj(np.fft.rfft2(_soft(before.roads, size), grown))
+    center, found = np.array([width, height]) / 2.0, []
+    reduced = _soft(mask.roads, size)
+    for degrees in _TURNS_DEG:
+        turn = cv2.getRotationMatrix2D(((size[0] - 1) / 2.0, (size[1] - 1) / 2.0), degrees, 1.0)
+        moved = np.fft.rfft2(cv2.warpAffine(reduced, turn, size), grown)
+        cover = np.fft.irfft2(np.conj(fixed * moved), grown)
+        rows, columns = (np.fft.fftfreq(n, 1.0 / n) for n in grown)
+        far = (np.abs(rows)[:, None] > _FARTHEST * size[1]) | (np.abs(columns)[None] > _FARTHEST * size[0])
+        # Where frames overlap less, less can agree.
+        shared = (1.0 - np.abs(rows)[:, None] / size[1]).clip(0.1) * (1.0 - np.abs(columns)[None] / size[0]).clip(0.1)
+        worth = np.where(far, -np.inf, cover / np.sqrt(shared))
+        angle = math.radians(degrees)
+        # OpenCV's angles turn counterclockwise as seen, in pixels with rows downwards.
+        rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        for _ in range(1 if count <= 2 else 2):
+            row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
+            shift = np.array([columns[column], rows[row]]) / scale
+            motion = np.eye(3)
+            motion[:2, :2], motion[:2, 2] = rotation, center - rotation @ center + shift
+            found.append((float(worth[row, column]), motion))
+            around = (np.abs(rows - rows[row]) < 8)[:, None] & (np.abs(columns - columns[column]) < 8)[None]
+            worth[around] = -np.inf
+    found.sort(key=lambda pair: -pair[0])
+    return [motion for _, motion in found[:count]]
+
+
+def _soft(roads: AnyArray, size: tuple[int, int]) -> AnyArray:
+    """Reduce a mask (H, W) bool to a size (width, height), blurred, with mean 0."""
+    soft = cv2.GaussianBlur(cv2.resize(roads.astype(np.float32), size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+    return np.asarray(soft - soft.mean(), np.float32)

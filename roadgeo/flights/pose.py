@@ -1,9 +1,9 @@
 """Where a frame lies, as the places of its corners with their covariance: predicted by motion, corrected by roads.
 
-An extended Kalman filter. Its state is a homography, as uncertain as the places of the frame's four corners, and the
-focal length, which all frames share. Measurements are the distances of the frame's road points from roads of the map,
-and that a pinhole with square pixels sees the plane so: motions that are free homographies bend the frames, and within
-a dozen of them they drift four times as far.
+An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers
+equivalent to a homography, and the focal length, which all frames share. Measurements are the distances of the frame's
+road points from roads of the map, and that a pinhole with square pixels sees the plane so: motions that are free
+homographies bend the frames, and within a dozen of them they drift four times as far.
 """
 
 from __future__ import annotations
@@ -11,26 +11,48 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography, shift
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import USUAL_FOCAL, USUAL_SIGMA
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.refinement import NO_PAIRS, NOT_HELD, Equations, RefineOptions, denormalise, normalise
 from roadgeo.matching.scene import Scene
 
-__all__ = ["FEWEST", "Pose", "correct", "predict", "start"]
+__all__ = ["FEWEST", "MIN_COS", "FilterOptions", "Pose", "correct", "predict", "start"]
 
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
-#: With fewer road points on roads a frame is not corrected. All points take part, however unsure their places are: the
-#: fit does not grow from a part of the frame, for all of it was predicted.
-FEWEST, _REFINEMENT = 20, RefineOptions(least_share=0.0, max_radius=(math.inf, 0.0), correlation_m=30.0)
+#: With fewer road points on roads a frame is not corrected; roads count that run the point's way, within this angle.
+FEWEST, MIN_COS = 20, math.cos(math.radians(25.0))
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """How motion and roads are weighed.
+
+    Attributes
+    ----------
+    sigma_m, sigma_px : float
+        Standard deviation of a road point across the road: the map's and the mask's.
+    correlation_m : float
+        Errors of the map and of the mask keep their sign over about this length of road.
+    radii : tuple of (float, float)
+        Search radius of each step of the adjustment in metres, and in standard deviations of the
+        prediction, away; the lesser of the two counts.
+    least_radius_m : float
+        They are always searched within this radius.
+    """
+
+    sigma_m: float = 1.2
+    sigma_px: float = 0.9
+    correlation_m: float = 30.0
+    radii: tuple[tuple[float, float], ...] = ((25.0, 3.0), (18.0, 2.5), (12.0, 2.0), (8.0, 1.5), (6.0, 1.5))
+    least_radius_m: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -39,29 +61,25 @@ class Pose:
 
     Attributes
     ----------
-    matrix : (3, 3) float64
-        Query plane to reference plane, metres.
+    corners : (4, 2) float64
+        TL, TR, BR, BL on the reference plane, metres.
     covariance : (9, 9) float64
-        Covariance of where it puts the corners, x0 y0 x1 y1 ..., metres, and of `log_focal`.
+        Covariance of the corners x0 y0 x1 y1 ..., metres, and of `log_focal`.
     frame : Frame
     log_focal : float
         Log of the focal length in halves of the frame's diagonal.
     """
 
-    matrix: FloatArray
+    corners: FloatArray
     covariance: FloatArray
     frame: Frame
     log_focal: float
 
     @property
     def homography(self) -> Homography:
-        """Pixel to the reference plane."""
-        return Homography(self.matrix @ PIXEL_TO_PLANE)
-
-    @property
-    def corners(self) -> FloatArray:
-        """(4, 2) TL, TR, BR, BL on the reference plane, metres."""
-        return self.homography(self.frame.corners)
+        """Pixel (column, row) to the reference plane."""
+        local = _Local.of(self)
+        return Homography(local.matrix(local.parameters(self.corners)) @ PIXEL_TO_PLANE)
 
     @property
     def center(self) -> FloatArray:
@@ -71,12 +89,12 @@ class Pose:
     @property
     def gsd_m(self) -> float:
         """Metres per pixel in the middle of the frame."""
-        return math.sqrt(abs(self.homography.area_scale(*self.frame.center.tolist())))
+        return math.sqrt(abs(float(np.linalg.det(self.homography.jacobian(self.frame.center)))))
 
     @property
     def sigma_m(self) -> float:
         """Standard deviation of the middle's place: root mean square of its distance from the truth."""
-        row = _Local.of(self).by_corners(np.zeros((1, 2)))
+        row = _rows(_Local.of(self), self.corners, np.zeros((1, 2)))
         return math.sqrt(float(np.trace(row @ self.covariance[:8, :8] @ row.T)))
 
     @property
@@ -94,50 +112,60 @@ def loosened(pose: Pose, shift_m: float) -> Pose:
 
 @dataclass(frozen=True)
 class _Local:
-    """A pose's homography in normalised coordinates (see `matching.refinement.normalise`): p (8,), origin and unit."""
+    """Normalised coordinates: of a frame, (0, 0) is its middle; of the plane, `origin`, in units of `unit` metres."""
 
     frame: Frame
-    p: FloatArray
     origin: FloatArray
     unit: float
 
     @classmethod
     def of(cls, pose: Pose) -> _Local:
-        return cls(pose.frame, *normalise(pose.matrix, pose.frame.plane_center, pose.frame.half_diagonal))
-
-    @property
-    def matrix(self) -> FloatArray:
-        """Query plane to reference plane."""
-        return denormalise(self.p, self.frame.plane_center, self.frame.half_diagonal, self.origin, self.unit)
+        diagonals = np.hypot(*(pose.corners[2:] - pose.corners[:2]).T)
+        return cls(pose.frame, pose.corners.mean(axis=0), float(diagonals.mean()) / 2.0)
 
     @property
     def corners(self) -> FloatArray:
-        """(4, 2) the frame's corners, normalised."""
-        return self.query(self.frame.corners)
+        """(4, 2) the frame's corners, y up."""
+        return self.query(self.frame.plane_corners)
 
-    def query(self, pixels: FloatArray) -> FloatArray:
-        """Normalise pixels (N, 2)."""
-        return np.asarray((pixels - self.frame.center) * (1.0, -1.0) / self.frame.half_diagonal)
+    def query(self, xy: FloatArray) -> FloatArray:
+        """Take (..., 2) points of the query plane to normalised ones."""
+        return np.asarray((xy - self.frame.plane_center) / self.frame.half_diagonal)
 
-    def sees(self, uv: FloatArray) -> bool:
-        """Whether normalised points (N, 2) lie clearly below the horizon."""
-        return bool((1.0 + uv @ self.p[6:] >= 0.05).all())
+    def parameters(self, corners: FloatArray) -> FloatArray:
+        """Return p (8,) of the map that takes the frame's corners to these (4, 2), metres."""
+        uv, xy = self.corners, (corners - self.origin) / self.unit
+        system = np.zeros((8, 8))
+        system[0::2, 0:2], system[0::2, 2] = uv, 1.0
+        system[1::2, 3:5], system[1::2, 5] = uv, 1.0
+        system[0::2, 6:], system[1::2, 6:] = -xy[:, :1] * uv, -xy[:, 1:] * uv
+        return np.asarray(np.linalg.solve(system, xy.ravel()))
 
-    def derivative(self, uv: FloatArray) -> FloatArray:
-        """Return the derivative (2N, 8) of places of normalised points, metres, by p."""
-        return np.asarray(self.unit * Homography(np.append(self.p, 1.0).reshape(3, 3)).by_elements(uv).reshape(-1, 8))
+    def places(self, p: FloatArray, uv: FloatArray) -> FloatArray:
+        """Return where p puts (N, 2) normalised points, metres."""
+        return np.asarray(self.origin + self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv))
 
-    def by_corners(self, uv: FloatArray) -> FloatArray:
-        """Return the derivative (2N, 8) of places of normalised points by the places of the frame's corners."""
-        return np.asarray(self.derivative(uv) @ np.linalg.inv(self.derivative(self.corners)))
+    def matrix(self, p: FloatArray) -> FloatArray:
+        """Return p as a map from the query plane, pixels, to the reference plane, metres; w is 1 in the middle."""
+        half, (x, y) = self.frame.half_diagonal, self.frame.plane_center
+        from_query = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, half]]) / half
+        to_plane = np.array([[self.unit, 0.0, self.origin[0]], [0.0, self.unit, self.origin[1]], [0.0, 0.0, 1.0]])
+        return np.asarray(to_plane @ np.append(p, 1.0).reshape(3, 3) @ from_query)
+
+    def derivative(self, p: FloatArray, uv: FloatArray) -> FloatArray:
+        """Return the derivative (2N, 8) of places, metres, by p."""
+        return np.asarray(self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).by_elements(uv).reshape(-1, 8))
+
+
+def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
+    """Return the derivative (2N, 8) of places of normalised points by the places of the frame's corners."""
+    p = local.parameters(corners)
+    return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
 
 
 def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> Pose:
     """Return the pose of a frame whose corners (4, 2) are known, with their covariance (8, 8), and of a usual lens."""
-    middle = corners.mean(axis=0)
-    there = (corners - middle).astype(np.float32)  # eastings and northings are large numbers
-    matrix = shift(*middle) @ cv2.getPerspectiveTransform(frame.plane_corners.astype(np.float32), there)
-    return Pose(matrix, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
+    return Pose(corners, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
 
 
 def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
@@ -150,14 +178,18 @@ def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
     sigma_px : float
         Standard deviation of where the motion puts a corner.
     """
-    local, motion = _Local.of(pose), Homography(motion).facing(pose.frame.center).matrix
-    seen = local.query(Homography(motion)(pose.frame.corners))
-    if not local.sees(seen):  # NaN neither
+    local = _Local.of(pose)
+    seen = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
+    if not np.isfinite(seen).all():
         return None
-    move = _beside_focal(local.by_corners(seen))
+    uv = local.query(seen * (1.0, -1.0))
+    p = local.parameters(pose.corners)
+    if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
+        return None
+    move = _beside_focal(_rows(local, pose.corners, uv))
     noise = np.diag([(pose.gsd_m * sigma_px) ** 2 / 2.0] * 8 + [_REFOCUSING**2])
-    matrix, covariance = pose.homography.matrix @ motion @ PIXEL_TO_PLANE, move @ pose.covariance @ move.T + noise
-    return _as_cameras_see(replace(pose, matrix=matrix, covariance=covariance))
+    moved = replace(pose, corners=local.places(p, uv), covariance=move @ pose.covariance @ move.T + noise)
+    return _as_cameras_see(moved)
 
 
 def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
@@ -168,23 +200,23 @@ def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
 def _as_cameras_see(pose: Pose) -> Pose:
     """Correct a pose by a measurement: both skews of a pinhole, of a focal length that is unknown too, are 0."""
     local = _Local.of(pose)
-    to_state = np.linalg.inv(_beside_focal(local.derivative(local.corners)))
+    corners, p = local.corners, local.parameters(pose.corners)
+    to_state = _beside_focal(np.asarray(np.linalg.inv(local.derivative(p, corners)), float))
     spread = to_state @ pose.covariance @ to_state.T
-    given = state = np.append(local.p, pose.log_focal)
+    given = state = np.append(p, pose.log_focal)
     for _ in range(3):
         off, rows = _skews(state)
         gain = np.linalg.solve(rows @ spread @ rows.T + _SKEW**2 * np.eye(2), rows @ spread).T
         state = given - gain @ (off + rows @ (given - state))
-    seen = replace(local, p=state[:8])
-    if not np.isfinite(state).all() or not seen.sees(local.corners):
+    if not np.isfinite(state).all() or (np.c_[corners, np.ones(4)] @ np.append(state[6:8], 1.0) < 0.05).any():
         return pose
-    back = _beside_focal(seen.derivative(local.corners))
+    back = _beside_focal(local.derivative(state[:8], corners))
     covariance = back @ (spread - gain @ rows @ spread) @ back.T
-    return Pose(seen.matrix, (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
+    return Pose(local.places(state[:8], corners), (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
 
 
 def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return both skews (2,) of a state, p of `_Local` and log of the focal length, and derivatives (2, 9).
+    """Return both skews (2,) of a state, parameters of `_Local` and log of the focal length, and derivatives (2, 9).
 
     Two unit vectors on the plane are perpendicular and equally long; how far a camera sees them from that.
     """
@@ -196,19 +228,54 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
     return skews[:, 0], (skews[:, 1:10] - skews[:, 10:]) / 2e-6
 
 
-def correct(pose: Pose, scene: Scene, roads: RoadBuckets) -> Pose | None:
+def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
     """Lay a frame's roads on the map's, starting from a predicted pose; None where there are too few."""
-    begun, before = pose.matrix / pose.matrix[2, 2], pose.covariance[:8, :8]
-    refined = Equations(begun, scene, roads, _REFINEMENT, known=before).adjust(NO_PAIRS, NOT_HELD)
-    if refined is None or refined.share * len(scene.points) < FEWEST:
-        return None
-    placed = replace(pose, matrix=Homography(refined.matrix).facing(scene.center).matrix)
-    if not np.isfinite(placed.corners).all():
-        return None
+    local, gsd = _Local.of(pose), pose.gsd_m
+    p = local.parameters(pose.corners)
+    corners = local.corners
+    before = pose.covariance[:8, :8]
+    weight = np.linalg.inv(before)
+    sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
+    spacing = scene.road_length_px * gsd / max(len(scene.points), 1)
+    share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
+    unsure = float(pose.corner_sigma_m.mean())
+    for most_m, deviations in options.radii:
+        radius = max(min(most_m, deviations * unsure), options.least_radius_m)
+        normal, right, met = _road_equations(local, p, scene, radius, max(sigma, radius / 3.0), roads)
+        if met < FEWEST:
+            return None
+        jacobian = local.derivative(p, corners)
+        scale = share * (local.unit / sigma) ** 2
+        pulled = (pose.corners - local.places(p, corners)).ravel()
+        step = np.linalg.solve(
+            scale * normal + jacobian.T @ weight @ jacobian, scale * right + jacobian.T @ weight @ pulled
+        )
+        p = p + step
+        if (np.c_[corners, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any() or not np.isfinite(p).all():
+            return None
+    jacobian = local.derivative(p, corners)
+    information = scale * normal + jacobian.T @ weight @ jacobian
+    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
     # The focal length follows the corners as far as it depended on them.
-    follows = np.linalg.solve(before, pose.covariance[:8, 8])
+    placed, follows = local.places(p, corners), pose.covariance[8, :8] @ weight
     both = np.vstack((np.eye(8), follows))
-    joint = both @ refined.corner_covariance_m2 @ both.T
-    joint[8, 8] += pose.covariance[8, 8] - follows @ before @ follows
-    log_focal = pose.log_focal + float(follows @ (placed.corners - pose.corners).ravel())
-    return replace(placed, covariance=(joint + joint.T) / 2.0, log_focal=log_focal)
+    joint = both @ covariance @ both.T + np.diag([0.0] * 8 + [pose.covariance[8, 8] - follows @ before @ follows])
+    log_focal = pose.log_focal + float(follows @ (placed - pose.corners).ravel())
+    return Pose(placed, (joint + joint.T) / 2.0, pose.frame, log_focal)
+
+
+def _road_equations(
+    local: _Local, p: FloatArray, scene: Scene, radius: float, sigma: float, roads: RoadBuckets
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return normal (8, 8) and right (8,) sides of normal dp = right, of all points that meet a road, and how many.
+
+    Residuals lie across the roads nearer than `radius` metres, in normalised units, with Cauchy weights by `sigma`.
+    """
+    ways, radii = np.empty((len(scene.points), 3)), np.full(len(scene.points), radius)
+    road_residuals(local.matrix(p), scene.points, scene.directions, radii, MIN_COS, roads, ways)
+    uv = local.query(scene.points)
+    met = np.isfinite(ways[:, 0]) & (1.0 + uv @ p[6:] >= 0.05)
+    away, normals = ways[met, 0], ways[met, 1:]
+    rows = np.einsum("ni,nij->nj", normals, local.derivative(p, uv[met]).reshape(-1, 2, 8)) / local.unit
+    weighted = rows / (1.0 + (away / sigma) ** 2)[:, None]
+    return weighted.T @ rows, weighted.T @ (away / local.unit), int(met.sum())

@@ -20,6 +20,7 @@ from roadgeo.flights.motion import TracedMask, between_images, overlay
 from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.reference import Reference
@@ -145,7 +146,7 @@ class _Net:
         if tracked.status != "located" or tracked.pose is None or tracked.reference is None:
             return False
         scene = trace_query(tracked.frame.mask)[0]
-        start = tracked.pose.matrix
+        start = tracked.pose.homography.matrix @ PIXEL_TO_PLANE
         checked = check_place(start / start[2, 2], scene, tracked.reference.index, _CHECK)
         return checked.verdict == "agrees"
 

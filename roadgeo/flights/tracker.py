@@ -19,8 +19,8 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, Look
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
-from roadgeo.flights.pose import Pose, correct, loosened, predict, start
-from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -199,7 +199,9 @@ class Tracker:
     def _judge(self, waiting: _Waiting, predicted: Pose, known_at: int, status: FrameStatus) -> Tracked:
         frame, scene, reference = waiting.frame, waiting.scene, self._reference
         corrected = (
-            None if scene is None or reference is None else correct(predicted, scene, reference.index.road_buckets)
+            None
+            if scene is None or reference is None
+            else correct(predicted, scene, reference.index.road_buckets, FilterOptions())
         )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
         if corrected is not None and scene is not None and reference is not None:
@@ -268,7 +270,7 @@ class Tracker:
         """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape
-        shrunk = [sampling(matrix @ PIXEL_TO_PLANE, (width, height)) for matrix in mosaic.to_mosaic]
+        shrunk = [_scale(matrix, Frame(width, height)) for matrix in mosaic.to_mosaic]
         if camera.gsd_m != CameraOptions().gsd_m:
             camera = replace(camera, gsd_m=(camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)))
         camera = replace(camera, focal_px=None)  # a mosaic is no picture by one camera
@@ -371,9 +373,15 @@ def _read(mosaic: Mosaic) -> Query | None:
         return None
 
 
+def _scale(matrix: FloatArray, frame: Frame) -> float:
+    """Return how many pixels of a mosaic a frame's pixel is wide, in its middle."""
+    return math.sqrt(abs(float(np.linalg.det(Homography(matrix).jacobian(frame.center)))))
+
+
 def _odds(pose: Pose, scene: Scene, reference: Reference) -> float:
     """Return the log10 odds of a frame at its place against places nearby."""
+    matrix = pose.homography.matrix @ PIXEL_TO_PLANE
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
     # rival: shifts that meet whole blocks are left out.
     evidence = Evidence(scene, reference.index, pose.gsd_m)
-    return evidence.weigh(pose.matrix) - max(evidence.nearby(pose.matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)
+    return evidence.weigh(matrix) - max(evidence.nearby(matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)

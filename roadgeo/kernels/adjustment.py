@@ -104,20 +104,13 @@ def add_row(
 
 @kernel()
 def begin_system(
-    p: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
+    p: NDArray[np.float64], prior: NDArray[np.float64], normal: NDArray[np.float64], right: NDArray[np.float64]
 ) -> None:
-    """Empty normal equations (n, n) and (n,) but for the weights `prior` (9, 9) that hold parameters near a mean."""
-    n = right.shape[0]
-    right[:] = 0.0
-    for r in range(n):
-        for c in range(n):
-            normal[r, c] = prior[r, c] if c <= r else 0.0  # as `add_row` leaves it
-            right[r] += prior[r, c] * (mean[c] - p[c])
-        normal[r, r] += 1e-9
+    """Empty normal equations (n, n) and (n,) but for the weights `prior` (9,) that hold parameters near zero."""
+    normal[:] = 0.0
+    for r in range(right.shape[0]):
+        normal[r, r] = 1e-9 + prior[r]
+        right[r] = -prior[r] * p[r]
 
 
 @kernel()
@@ -445,7 +438,7 @@ def adjust(
     shares = np.ones(limits.n_cells)
     previous, rms = -1, np.inf
     for iteration in range(limits.n_iterations + 1):
-        begin_system(p, limits.prior, limits.mean, normal, system.right)
+        begin_system(p, limits.prior, normal, system.right)
         if not _add_pairs(p, plane.unit, points.half_side, pairs, limits, shares, system):
             return -1, np.inf
         if iteration < _HELD_STEPS:

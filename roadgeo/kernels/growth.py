@@ -34,8 +34,7 @@ class _Growth(NamedTuple):
     unit: float  # metres per normalised unit
     sigma_m: float
     radius_m: float
-    prior: Floats2  # (9, 9) and (9,), see `begin_system`
-    mean: Floats1
+    prior: Floats1  # (9,), see `begin_system`
     gain: float  # of the log-likelihood ratio by a hit, and by a miss
     loss: float
     query: Floats2  # (N, 2) normalised
@@ -62,8 +61,8 @@ def _begin(
     for i in range(n):
         normalised[i, 0] = (query.xy[i, 0] - query.xy[query.anchor, 0]) / query.half_size
         normalised[i, 1] = (query.xy[i, 1] - query.xy[query.anchor, 1]) / query.half_size
-    prior = np.zeros((9, 9))
-    prior[6, 6] = prior[7, 7] = (sigma_m / unit) ** 2 / limits.perspective_sigma**2
+    prior = np.zeros(9)
+    prior[6] = prior[7] = (sigma_m / unit) ** 2 / limits.perspective_sigma**2
     return _Growth(
         points.xy[ref_anchor, 0],
         points.xy[ref_anchor, 1],
@@ -71,7 +70,6 @@ def _begin(
         sigma_m,
         limits.radius[0] + limits.radius[1] * gsd,
         prior,
-        np.zeros(9),
         math.log(limits.hit_rate / limits.chance_rate),
         math.log((1.0 - limits.hit_rate) / (1.0 - limits.chance_rate)),
         normalised,
@@ -123,7 +121,7 @@ def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
     query, image, p, normal, right, row = (
         growth.query, growth.image, growth.p, growth.normal, growth.right, growth.row,
     )  # fmt: skip
-    begin_system(p, growth.prior, growth.mean, normal, right)
+    begin_system(p, growth.prior, normal, right)
     n = 0
     for i in range(matched.shape[0]):
         if matched[i] >= 0:

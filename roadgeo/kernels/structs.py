@@ -187,7 +187,6 @@ class AdjustLimits(NamedTuple):
     sigma_m: float  # standard deviation of a road point across the road in the middle of the frame
     map_sigma_m: float  # the map's part of it
     mask_sigma: float  # and the mask's, normalised units of the query
-    prior: Floats2  # (9, 9) weights that hold parameters near `mean`
-    mean: Floats1  # (9,)
+    prior: Floats1  # (9,) weights that hold parameters near zero
     n_iterations: int
     tolerance_m: float

@@ -136,7 +136,7 @@ class _Judge:
     def propose(self) -> list[FloatArray]:
         """Return the starts of the places nearby."""
         center = Homography(self.start)(self.scene.center)
-        shifts = search_nearby(self.start, self.scene, self.index.road_buckets, self.options.search)
+        shifts = search_nearby(self.start, self.scene, self.index, self.options.search)
         return [move_about(center, shift) @ self.start for shift in shifts]
 
     def refine_all(self, starts: Sequence[FloatArray]) -> list[_Place]:

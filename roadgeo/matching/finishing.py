@@ -154,14 +154,14 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
     The matrix does not change, nor does the covariance if too few roads are met.
     """
     k1 = refined.lens_k1
-    equations = Equations(refined.matrix, scene, index.road_buckets, options, k1 or None)
+    equations = Equations(refined.matrix, scene, index, options, k1 or None)
     which = equations.meet()
     if which.sum() < FEWEST:
         return refined
     rows, residuals, sigmas, own, _ = (values[which] for values in equations.met)
     cauchy, free = equations.cauchy[which], rows.shape[1]
     weights = equations.weight * cauchy / own**2
-    prior = equations.prior[:free, :free] + 1e-9 * np.eye(free)
+    prior = np.diag(equations.prior[:free]) + 1e-9 * np.eye(free)
     starts = _starts_of_pieces(scene, which)
     squares = rows[:, :, None] * rows[:, None, :]
     at_end = np.abs(residuals / sigmas) > _NEAR_END

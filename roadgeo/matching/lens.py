@@ -66,7 +66,7 @@ def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refineme
 
     A fit may have settled where only that part agrees. Returns None if hardly more of the road points lie on roads.
     """
-    before = Equations(matrix, scene, index.road_buckets, refinement).meet().mean()
+    before = Equations(matrix, scene, index, refinement).meet().mean()
     found = fit_lens(matrix, scene, index, refinement, None)
     return found if found is not None and found.share > before + _BETTER else None
 
@@ -94,7 +94,7 @@ def fit_lens(
     start : float, optional
         Value of k1 to begin with, other than `k1`.
     """
-    equations = Equations(matrix, scene, index.road_buckets, replace(refinement, max_radius=_MAX_RADIUS), k1)
+    equations = Equations(matrix, scene, index, replace(refinement, max_radius=_MAX_RADIUS), k1)
     (core,) = np.nonzero(_core(equations.meet(), scene.points, scene.size))
     if len(core) < FEWEST:
         return None

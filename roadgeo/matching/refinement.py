@@ -14,12 +14,11 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.adjustment import adjust, meet_roads
 from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.roads import road_residuals
-from roadgeo.kernels.structs import AdjustLimits, Held, Met, Plane, PointPairs, RoadBuckets, RoadSamples
+from roadgeo.kernels.structs import AdjustLimits, Held, Met, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = [
-    "NOT_HELD",
     "NO_PAIRS",
     "Equations",
     "RefineOptions",
@@ -44,6 +43,9 @@ _SIGMA_M, _SIGMA_PX = 1.2, 0.9
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
+#: Errors of the map and of the mask are correlated over about this length of road, metres: closer points are not
+#: independent observations.
+_CORRELATION_M = 60.0
 #: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
 #: greater, they keep their sign as much further. Fitted to the corners of training masks.
 _USUAL_RMS = 0.7
@@ -57,9 +59,8 @@ _N_ITERATIONS, _TOLERANCE_M = 15, 0.02
 _SIGMA_FLOOR = (0.1, 0.15)
 #: Prior standard deviation of k1.
 _K1_SIGMA = 0.1
-#: No matched intersections, and no points that are held.
+#: No matched intersections.
 NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), 0.0)
-NOT_HELD = Held(np.empty((0, 2)), np.empty((0, 2)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,11 @@ class RefineOptions:
         A cell of the frame takes part when at least this share of its road points meet roads.
     max_radius : (float, float)
         Points whose place is less sure than a third of the sum of metres and pixels do not take part yet.
-    correlation_m : float
-        Errors of the map and of the mask are correlated over about this length of road: closer points are not
-        independent observations.
     """
 
     perspective_sigma: float = 0.5
     least_share: float = 0.5
     max_radius: tuple[float, float] = (20.0, 10.0)
-    correlation_m: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -149,8 +146,8 @@ class Equations:
         Metres per normalised unit of the reference plane.
     weight : float
         Weight of a road point, relative to an independent observation of `sigma_m` in the middle of the frame.
-    prior : (9, 9) float64
-        Weights that hold parameters near zero, or near the start where its covariance is known.
+    prior : (9,) float64
+        Weights that hold parameters near zero.
     met : Met
         The roads that the points met last.
     """
@@ -159,35 +156,29 @@ class Equations:
         self,
         matrix: FloatArray,
         scene: Scene,
-        roads: RoadBuckets,
+        index: ReferenceIndex,
         options: RefineOptions,
         k1: float | None = None,
         step: int = 1,
-        known: FloatArray | None = None,
     ) -> None:
-        """Use each `step`-th road point. Without a `k1` the camera stays a pinhole.
-
-        `known`: covariance (8, 8) of the frame's corners, square metres, by which they may lie off `matrix`.
-        """
-        self.scene, self.options, self.roads, self._is_known = scene, options, roads, known is not None
+        """Use each `step`-th road point. Without a `k1` the camera stays a pinhole."""
+        self.scene, self.options, self.roads = scene, options, index.road_buckets
         p, self._origin, self.unit = normalise(matrix, scene.center, scene.half_size)
         self.p, free = np.array([*p, k1 or 0.0]), 8 if k1 is None else 9
         self.gsd = gsd = self.unit / scene.half_size
         self.sigma_m = math.hypot(_SIGMA_M, _SIGMA_PX * gsd)
-        sigmas, mean = np.array([np.inf] * 6 + [options.perspective_sigma] * 2 + [_K1_SIGMA]), np.zeros(9)
-        self.prior = np.diag((self.sigma_m / self.unit / sigmas) ** 2)
-        if known is not None:
-            by_p, mean = self._corners_by_p(), self.p.copy()
-            self.prior[:8, :8] = self.sigma_m**2 * by_p.T @ np.linalg.inv(known) @ by_p
+        self.prior = np.zeros(9)
+        self.prior[6:8] = (self.sigma_m / self.unit / options.perspective_sigma) ** 2
+        self.prior[8] = (self.sigma_m / self.unit / _K1_SIGMA) ** 2
         spacing_m = scene.road_length_px * gsd / max(len(scene.points), 1)
-        self.weight = min(1.0, spacing_m * step / options.correlation_m)
+        self.weight = min(1.0, spacing_m * step / _CORRELATION_M)
         xy, along, cells = _samples(scene, step)
         half_side = max(scene.size) / 2.0 / scene.half_size
         self.samples = RoadSamples(xy, along, cells, self.weight, half_side)
         self._plane = Plane(self.unit, *self._origin.tolist())
         self._limits = AdjustLimits(
             _N_CELLS**2, options.least_share, options.max_radius[0] + options.max_radius[1] * gsd,
-            MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, mean, _N_ITERATIONS, _TOLERANCE_M,
+            MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, _TOLERANCE_M,
         )  # fmt: skip
         n = len(xy)
         self.met = Met(np.empty((n, free)), np.full(n, np.nan), np.ones(n), np.empty(n), np.empty(n, np.bool_))
@@ -233,8 +224,6 @@ class Equations:
         normal.flat[:: n + 1] *= 0.5
         # Where the mask is bent, larger errors are correlated over proportionally longer roads.
         scatter = rms * max(1.0, rms / (_USUAL_RMS * self.sigma_m)) / self.unit
-        if self._is_known:  # which the scatter says nothing of
-            scatter = self.sigma_m / self.unit
         covariance = np.asarray(np.linalg.inv(normal) * scatter**2, float)
         corners = self.corner_covariance(covariance[:8, :8])
         found = denormalise(self.p[:8], self.scene.center, self.scene.half_size, self._origin, self.unit)
@@ -244,13 +233,9 @@ class Equations:
 
     def corner_covariance(self, covariance: FloatArray) -> FloatArray:
         """Return the covariance (8, 8) of the frame's corners, square metres, from the homography's (8, 8)."""
-        derivatives = self._corners_by_p()
+        derivatives = self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
         floor = _SIGMA_FLOOR[0] ** 2 + (_SIGMA_FLOOR[1] * self.gsd) ** 2
         return np.asarray(derivatives @ covariance @ derivatives.T * self.unit**2 + 0.5 * floor * np.eye(8))
-
-    def _corners_by_p(self) -> FloatArray:
-        """Return the derivative (8, 8) of where the frame's corners lie, normalised, by the homography."""
-        return self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
 
 
 @lru_cache(maxsize=8)
@@ -281,7 +266,7 @@ def _grid(n: int) -> FloatArray:
 
 def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> float:
     """Return the sum of the Cauchy weights of road points under a homography."""
-    equations = Equations(matrix, scene, index.road_buckets, RefineOptions())
+    equations = Equations(matrix, scene, index, RefineOptions())
     equations.meet()
     return float(np.nansum(equations.cauchy))
 
@@ -309,7 +294,7 @@ def refine(
         Hold the homography near its start even with enough matches: it is right all over the frame.
     """
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
-    equations = Equations(matrix, scene, index.road_buckets, options or RefineOptions(), step=step)
+    equations = Equations(matrix, scene, index, options or RefineOptions(), step=step)
     # Isolated matches are probably accidental.
     chosen = matched >= 0
     around = scene.neighbours[chosen]

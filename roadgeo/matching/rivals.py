@@ -344,7 +344,7 @@ def similar_places(
         turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
         if judge(turned, scene.size, match.camera) is CameraFault.HEADING:
             continue
-        shifts = search_nearby(turned, scene, index.road_buckets, around, drawn)
+        shifts = search_nearby(turned, scene, index, around, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
     found.sort(key=lambda place: -place[0])
     fits = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])

@@ -17,7 +17,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.kernels.structs import RoadBuckets
+from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
 __all__ = [
@@ -100,7 +100,7 @@ def shifted(matrix: FloatArray, east_m: float, north_m: float) -> FloatArray:
 def search_nearby(
     start: FloatArray,
     scene: Scene,
-    roads: RoadBuckets,
+    index: ReferenceIndex,
     options: LocalSearchOptions | None = None,
     drawn: Drawn | None = None,
 ) -> list[Shift]:
@@ -127,7 +127,7 @@ def search_nearby(
     radius = float(np.hypot(*(frame - center).T).max())
     drawn, reach_m = {} if drawn is None else drawn, radius + options.reach_m
     key = (*np.round(center, 3).tolist(), round(reach_m, 3))
-    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(roads, center, reach_m, options)
+    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m, options)
     best: list[Shift] = []
     for turn in _turns(radius, options):
         turned = Homography(move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)))
@@ -143,13 +143,13 @@ def _turns(radius_m: float, options: LocalSearchOptions) -> FloatArray:
 
 
 def _draw_layers(
-    roads: RoadBuckets, center: FloatArray, reach_m: float, options: LocalSearchOptions
+    index: ReferenceIndex, center: FloatArray, reach_m: float, options: LocalSearchOptions
 ) -> tuple[AnyArray, FloatArray]:
     """Draw the roads around a point: (16, rows, columns) uint8, 1 on roads; and the first cell's corner (2,)."""
     cell = options.cell_m
     side = math.ceil(2.0 * (reach_m + 2.0 * cell) / cell)
     origin = center - side * cell / 2.0
-    a, b = roads.segments[:, :2].astype(float) - origin, roads.segments[:, 2:].astype(float) - origin
+    a, b = index.segments[:, :2].astype(float) - origin, index.segments[:, 2:].astype(float) - origin
     outside = (np.minimum(a, b) > side * cell).any(axis=1) | (np.maximum(a, b) < 0.0).any(axis=1)
     a, b = a[~outside], b[~outside]
     angle = np.arctan2(*(b - a).T[::-1]) % math.pi

@@ -12,6 +12,7 @@ from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.evaluation.demo import PHOTO
+from roadgeo.flights import frames
 from roadgeo.flights.frames import FrameOptions, read_frames, read_stills
 from roadgeo.running.options import ReadOptions
 from roadgeo.sources.masks import read_mask
@@ -186,13 +187,22 @@ def white(photographs: list[str], tmp_path: Path) -> str:
     return str(tmp_path / "white.png")
 
 
-@pytest.mark.parametrize(("in_order", "place"), [(True, 1), (True, 2), (False, 0), (False, 1), (False, 2)])
 def test_a_white_frame_among_photographs_is_no_mask(
-    model: FrameOptions, photographs: list[str], white: str, in_order: bool, place: int
+    model: FrameOptions, photographs: list[str], white: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is one of an archive, wherever it comes."""
+    taken: list[str] = []
+    monkeypatch.setattr(frames, "read_mask", lambda path, **_: taken.append(path) or read_mask(path))
+    assert len(list(read_frames([photographs[0], white, white, photographs[1]], model))) == 4
+    assert taken == [photographs[0]]  # which was found to be none
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_nor_is_one_of_an_archive_wherever_it_comes(
+    model: FrameOptions, photographs: list[str], white: str, place: int
+) -> None:
     assert read_mask(white).roads[:40, :120].all()
     given = [*photographs[:place], white, *photographs[place:2]]
-    read = list(read_frames(given, model)) if in_order else [frame for frame, _ in read_stills(given, model)]
-    assert [frame.name for frame in read] == [Path(path).name for path in given]
-    assert not read[place].mask.roads[:40, :120].any()
+    read = list(read_stills(given, model))
+    assert [frame.name for frame, _ in read] == [Path(path).name for path in given]
+    assert not read[place][0].mask.roads[:40, :120].any()
+    assert all(grey is not None for k, (_, grey) in enumerate(read) if k != place)

@@ -3,10 +3,12 @@
 import math
 
 import numpy as np
+import pytest
 
 from examples.simulated_flights import FlightOptions, _draw_views, _motion
-from roadgeo.flights.pose import predict, start
+from roadgeo.flights.pose import _Local, _skews, predict, start
 from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.pinhole import make_view
 
 
 class Anywhere:
@@ -51,3 +53,15 @@ def test_a_camera_that_leans_shows_its_focal_length():
         claimed.append(math.sqrt(pose.covariance[8, 8]))
     assert max(claimed) < 0.15
     assert np.abs(off).max() < 3.0 * max(claimed)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 5.0, 40.0])
+def test_pinholes_have_no_skew_and_others_have(tilt):
+    view, frame = make_view((30.0, 20.0), (640, 480), 0.5, tilt, 70.0, 20.0), Frame(640, 480)
+
+    def skews(footprint):
+        local = _Local.of(start(footprint, frame, np.eye(8)))
+        return _skews(np.append(local.parameters(footprint), math.log(640 / 400)))[0]
+
+    assert np.allclose(skews(view.footprint), 0.0, atol=1e-9)
+    assert np.abs(skews(view.footprint * (1.1, 1.0))).max() > 0.05

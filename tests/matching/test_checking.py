@@ -78,9 +78,7 @@ def test_hardly_a_road_is_no_evidence(town) -> None:
 
 def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:
     truth, scene = sights[1]
-    best = search_nearby(
-        lied(truth, scene, Shift(150, -90, 4, 1, 0)), scene, town[1].road_buckets, LocalSearchOptions()
-    )[0]
+    best = search_nearby(lied(truth, scene, Shift(150, -90, 4, 1, 0)), scene, town[1], LocalSearchOptions())[0]
     assert (best.east_m, best.north_m) == pytest.approx((-150, 90), abs=8)
     assert best.turn_deg == pytest.approx(-4, abs=1.2)
 

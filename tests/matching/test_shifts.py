@@ -10,7 +10,7 @@ def test_of_shifts_that_agree_equally_the_nearest_come_first():
     """Where all blocks are equal, those beside are, and not those of one end of the map."""
     truth, index, among = contest(1.0)
     options = LocalSearchOptions(reach_m=400.0, turn_deg=0.0, cell_m=10.0, road_m=30.0, max_points=100, n_places=6)
-    found = search_nearby(truth, among.scene, index.road_buckets, options)
+    found = search_nearby(truth, among.scene, index, options)
     away = [np.hypot(result.east_m, result.north_m) for result in found]
     alike = [length for length, result in zip(away, found, strict=True) if result.share == found[0].share]
     assert len(alike) > 3

@@ -428,8 +428,8 @@ def adjust(p, free, plane, points, pairs, held, limits, segments):
     shares = np.ones(limits.n_cells)
     previous, rms, normal, half_side = -1, np.inf, None, points.half_side
     for iteration in range(limits.n_iterations + 1):
-        prior = limits.prior[:free, :free]
-        before, normal, right = normal, prior + 1e-9 * np.eye(free), prior @ (limits.mean - p)[:free]
+        prior = limits.prior[:free]
+        before, normal, right = normal, np.diag(prior + 1e-9), -prior * p[:free]
         both = []
         for pair, target, cell in zip(pairs.query, pairs.reference, pairs.cells, strict=True):
             far = np.hypot(*(target - see(p, half_side, pair))) * plane.unit
