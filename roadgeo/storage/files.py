@@ -91,7 +91,7 @@ def replacing(path: str | os.PathLike[str], sync: bool = True, *, may_exist: boo
     target = Path(path)
     try:
         with writing(target):
-            _remove_leftovers_once(target.parent)
+            _remove_leftovers_once(target.parent.absolute())
             with _locked_folder(target.parent) as folder:
                 staged = folder / target.name
                 yield staged

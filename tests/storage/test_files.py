@@ -91,6 +91,14 @@ def test_a_living_writer_is_left_alone_and_a_dead_one_cleared_away(tmp_path: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_folders_of_one_relative_name_are_each_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for place in ("first", "second"):
+        (tmp_path / place / "out" / ".roadgeo-abc.tmp").mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / place)
+        write_text(Path("out/a.txt"), "")
+        assert [path.name for path in Path("out").iterdir()] == ["a.txt"]
+
+
 def test_foreign_files_of_similar_names_stay(tmp_path: Path) -> None:
     (tmp_path / ".roadgeo-notes.tmp").mkdir()
     (tmp_path / ".roadgeo-notes.tmp" / "mine.txt").touch()
