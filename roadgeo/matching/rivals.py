@@ -112,7 +112,7 @@ class Other(NamedTuple):
 
 
 class Rivals:
-    """Compares the likeliest place of each part of a map with its best rival; each place once."""
+    """Compares the likeliest place of each part of a map with its best rival, anew where further places were met."""
 
     def __init__(
         self,
