@@ -38,7 +38,7 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["N_LAID", "Other", "Rivals", "Standing", "log10_gap", "similar_places"]
+__all__ = ["Other", "Rivals", "Standing", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -66,7 +66,7 @@ _DISBELIEVED = 6.0
 #: refinement of places around.
 _N_KNOWN, _N_POINTS = 12, 200
 #: Number of the likeliest places around that are fully refined.
-N_LAID = 8
+_N_LAID = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
@@ -349,8 +349,8 @@ def similar_places(
     found.sort(key=lambda place: -place[0])
     fits = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])
     roughly = sorted((Other(*compare(fit), fit) for fit in fits), key=lambda other: -other.worth)
-    finely = (_lay(other.matrix, scene, index, match, None) for other in roughly[:N_LAID])
-    return [*(Other(*compare(fit), fit) for fit in finely), *roughly[N_LAID:]]
+    finely = (_lay(other.matrix, scene, index, match, None) for other in roughly[:_N_LAID])
+    return [*(Other(*compare(fit), fit) for fit in finely), *roughly[_N_LAID:]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from roadgeo.errors import RoadgeoError
 from roadgeo.location import Location
-from roadgeo.matching.methods import Found, may_show, search_references
+from roadgeo.matching.methods import may_show, search_references
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.search import Ahead
 from roadgeo.matching.triples import larger
@@ -195,19 +195,12 @@ class _Searcher:
         """Search parts together; all places are less likely by `against` (log10), for the rest of the map."""
         parts = [self.parts[name] for name in names]
         found = search_references(query, parts, options, options.search.time_limit_s)
-        found = [_less_likely(result, against) for result in found]
+        found = [result.less_likely(against) for result in found]
         least = options.min_log10_odds - options.min_margin
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
         fits = [fit for result in found for fit in result.fits if fit.log10_odds >= least]
         places = [(fit.log10_odds, by_path[_path(fit.index)]) for fit in fits]
         return _Answer(decide(query, found, options), places, names)
-
-
-def _less_likely(found: Found, against: float) -> Found:
-    fits, further = (
-        tuple(replace(fit, log10_odds=fit.log10_odds - against) for fit in some) for some in (found.fits, found.further)
-    )
-    return replace(found, fits=fits, further=further)
 
 
 def _path(part: Any) -> str:
