@@ -16,9 +16,10 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar
 
 from roadgeo.errors import RoadgeoError
+from roadgeo.storage.files import remove_own
 
 __all__ = ["Work", "end_with_parent", "outlive", "run", "without_interrupts"]
 
@@ -138,22 +139,32 @@ _prepared: list[Callable[[Any], Any]] = []
 def _start_worker(work: Work[Any, Any]) -> None:
     """Make a worker ready. Ctrl-C is the parent's to handle: it ends the workers, which clean up as they go."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    signal.signal(signal.SIGTERM, _exit)
     try:
         end_with_parent()
         import cv2
 
         cv2.setNumThreads(1)  # the processes share the processors already
         _prepared.append(work.prepare())
-    except SystemExit as end:  # the pool would report it as a fault
-        os._exit(int(end.code or 0))
+    except SystemExit:  # the pool would report it as a fault
+        _leave()
 
 
 def _do(task: Any) -> Any:
     try:
         return _prepared[0](task)
-    except SystemExit as end:  # the task has cleaned up; the pool would take this for its result, and go on
-        os._exit(int(end.code or 0))
+    except SystemExit:  # the task has cleaned up; the pool would take this for its result, and go on
+        _leave()
+
+
+def _exit(*_: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
+    sys.exit()
+
+
+def _leave() -> NoReturn:
+    remove_own()
+    os._exit(128 + signal.SIGTERM)
 
 
 def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:

@@ -7,6 +7,7 @@ anew and is the user's alone, and a link at the target is replaced: nobody leads
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -24,10 +25,22 @@ try:
 except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["make_folder", "remove_leftovers", "replacing", "sync_file", "write_bytes", "write_text", "writing"]
+__all__ = [
+    "make_folder",
+    "remove_leftovers",
+    "remove_own",
+    "replacing",
+    "sync_file",
+    "write_bytes",
+    "write_text",
+    "writing",
+]
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
+
+#: Staging folders of this process.
+_own: set[Path] = set()
 
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another disk",
@@ -155,11 +168,20 @@ def _locked_folder(parent: Path) -> Iterator[Path]:
     finally:
         lock.close()
         shutil.rmtree(folder, ignore_errors=True)
+        _own.discard(folder)
+
+
+@atexit.register
+def remove_own() -> None:
+    """Remove the staging folders of a process that ends: an interrupt may have come while one was made or removed."""
+    while _own:
+        shutil.rmtree(_own.pop(), ignore_errors=True)
 
 
 def _make_folder(parent: Path) -> tuple[Path, BinaryIO]:
     while True:
         folder = parent / f"{_PREFIX}{os.urandom(6).hex()}{_SUFFIX}"
+        _own.add(folder)
         folder.mkdir(mode=0o700)
         try:
             lock = (folder / _LOCK).open("xb")

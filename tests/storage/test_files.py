@@ -6,6 +6,7 @@ import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,6 +47,27 @@ def test_nothing_is_left_when_writing_fails(tmp_path: Path, error: type[BaseExce
     with pytest.raises(OutputError if error is OSError else error):
         fail()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("where", ["mkdir", "rmtree"])
+def test_an_interrupt_while_a_folder_is_made_or_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    owner = Path if where == "mkdir" else files.shutil
+    real = getattr(owner, where)
+
+    def interrupted(*given: Any, **more: Any) -> None:
+        monkeypatch.setattr(owner, where, real)
+        if where == "mkdir":
+            real(*given, **more)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(owner, where, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(tmp_path / "a.txt", "whole")
+    assert [path.suffix for path in tmp_path.iterdir() if path.is_dir()] == [".tmp"]
+    files.remove_own()  # as a process does that ends
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
 @pytest.mark.parametrize(
