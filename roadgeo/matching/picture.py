@@ -44,7 +44,9 @@ _ROAD_M = 8.0
 #: This length of the map's roads counts as one independent statement, metres, but never fewer than a fifth as many
 #: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
 #: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
-_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 320.0, 500.0, 0.2
+_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 250.0, 500.0, 0.2
+#: Greatest log10 likelihood of which the part counts that a rival lacks.
+_MOST_WORTH = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
 #: Pixel sizes, a factor apart, at which a drawn mask's roads are as wide as a road.
@@ -110,6 +112,15 @@ class Picture:
             under += np.bincount(cut.ravel(), ground.roads[top:bottom, left:right].ravel(), n)
         unit = _length_px(ground.cell_m, gsd_m) / self.statement_px
         return np.asarray(unit * ((levels.on @ under)[:, None] + levels.off @ (whole - under)))
+
+    @staticmethod
+    def lead(worth: float, rival: float) -> float:
+        """Return the log10 lead of a place over a rival, from the log10 L of each.
+
+        In a grid that resembles its mirror image, a wrong place leads by a constant part of its likelihood, and so by
+        more the larger the frame. Of likelihoods beyond `_MOST_WORTH` only the part that the rival lacks counts.
+        """
+        return (worth - max(rival, 0.0)) * min(1.0, _MOST_WORTH / max(worth, 1e-9))
 
     def settle(self, peak: Peak) -> Peak:
         """Move a place found on coarse cells by steps of a fine cell to where it is likeliest."""

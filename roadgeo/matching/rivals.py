@@ -59,9 +59,6 @@ _WORTH_LOOKING = 0.5
 #: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
 #: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
 _DOUBT = 60.0
-#: A place has no lead by the picture if it loses this score: in a grid that equals its mirror image the lead grows with
-#: the frame, and so must the part that is taken off.
-_DISBELIEVED = 6.0
 #: Number of the likeliest places met by the search that are compared; and number of road points for the rough
 #: refinement of places around.
 _N_KNOWN, _N_POINTS = 12, 200
@@ -207,13 +204,12 @@ class Rivals:
         for reach_m in _REACHES_M:
             others += _around(picture, best.matrix, reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.worth, default=None)
-            lead = worth - max(0.0 if rival is None else rival.worth, 0.0)
-            if not _WORTH_LOOKING * self.needed <= lead < _CERTAIN:
+            likelihood = -math.inf if rival is None else rival.worth
+            lead = picture.lead(worth, likelihood)
+            if not _WORTH_LOOKING * self.needed <= lead < 2.0 * self.needed:
                 break
-        lead = lead * max(1.0 - self.doubt(estimator, best) / _DISBELIEVED, 0.0) - self._by_chance
-        if rival is None:
-            return Standing(best, None, lead, worth)
-        return Standing(best, rival.matrix, lead, worth, rival.worth)
+        lead = max(lead - self.doubt(estimator, best), 0.0) - self._by_chance
+        return Standing(best, None if rival is None else rival.matrix, lead, worth, likelihood)
 
     def _by_roads(self, part: Search[Hypothesis]) -> Standing | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""

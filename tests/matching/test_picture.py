@@ -111,3 +111,10 @@ def test_a_frame_too_large_for_the_ground_weighs_nothing(town, scene):
     picture = Picture(soft(scene), town[1], 1.0)
     with np.errstate(all="ignore"):
         assert picture.weigh(np.diag([400.0, 1.0, 1.0]) @ TRUTH) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("worth", "rival", "lead"), [(8.0, 3.0, 5.0), (100.0, 80.0, 2.0), (5.0, -3.0, 5.0), (-1.0, -2.0, -1.0)]
+)
+def test_of_a_large_frame_only_the_part_that_the_rival_lacks_counts(worth, rival, lead):
+    assert Picture.lead(worth, rival) == pytest.approx(lead)
