@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -185,7 +184,7 @@ class _Judge:
                 place = self.picture.settle(peak)
                 rivals.append(_Place(place.matrix, place.worth, best.matched, None))
         hardest = max(rivals, key=lambda rival: rival.worth, default=None)
-        return self.picture.lead(best.worth, -math.inf if hardest is None else hardest.worth), hardest
+        return self.picture.lead(best.worth, 0.0 if hardest is None else hardest.worth), hardest
 
     def without_twins(self, matrix: FloatArray) -> Scene:
         """Return the scene without road points that have parallel roads of the map on both sides.

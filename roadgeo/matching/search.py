@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search", "search_together"]
+__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search_together"]
 
 
 Model = TypeVar("Model")
@@ -96,7 +96,7 @@ class Search(Generic[Model]):
         """Begin, without doing anything yet."""
         self.estimator = estimator
         self.score, self.best = float("-inf"), None  # type: float, Model | None
-        self.stage = self.n_rounds = self.n_scored = 0
+        self.stage = 0
         self.ended = False
         self.stopped = ""
         self.seconds = 0.0
@@ -113,7 +113,6 @@ class Search(Generic[Model]):
             self.ended = self._rounds is None
             self.stage += 1
         else:
-            self.n_rounds += 1
             self._take(models, budget)
         self._charge(budget)
         self.seconds += time.perf_counter() - started
@@ -124,7 +123,6 @@ class Search(Generic[Model]):
             score = self.estimator.score(model)
             if self.best is None or score > self.score:
                 self.score, self.best = score, model
-            self.n_scored += 1
             self._charge(budget)
             if budget.spent:
                 break
@@ -134,13 +132,6 @@ class Search(Generic[Model]):
         work = self.estimator.work
         budget.left_s -= work - self._charged_s
         self._charged_s = work
-
-
-def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> Search[Model]:
-    """Score hypotheses round by round until an answer stands out, they are exhausted, or a limit is reached."""
-    alone = Search(estimator)
-    search_together([alone], options)
-    return alone
 
 
 def search_together(

@@ -26,15 +26,8 @@ except ImportError:  # Windows: there an open file cannot be deleted, which serv
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
-    "make_folder",
-    "remove_leftovers",
-    "remove_own",
-    "replacing",
-    "sync_file",
-    "write_bytes",
-    "write_text",
-    "writing",
-]
+    "make_folder", "remove_leftovers", "remove_own", "replacing", "sync_file", "write_bytes", "write_text", "writing",
+]  # fmt: skip
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"

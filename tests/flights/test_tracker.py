@@ -42,11 +42,16 @@ def test_all_frames_are_placed_to_metres_those_that_waited_too(flight):
     assert tracked[0].known_at > 0 or len(flown.views) == 1
 
 
-def test_a_cut_is_noticed_within_three_frames_and_taken_back(flight):
-    _, frames, reference = flight
+def followed(frames, reference):
+    """Return a tracker that was fed frames."""
     tracker = Tracker([reference])
     for frame in frames:
         tracker.feed(frame)
+    return tracker
+
+
+def test_a_cut_is_noticed_within_three_frames_and_taken_back(flight):
+    frames, tracker = flight[1], followed(*flight[1:])
     assert not tracker.is_lost
     rng = np.random.default_rng(3)
     news = []
@@ -72,10 +77,7 @@ def test_a_frame_without_roads_is_followed_by_its_motion(flight):
 
 def test_a_frame_that_contradicts_its_motion_may_be_anywhere_and_is_not_sent(flight):
     """As after frames that a link dropped: the motion is that of before."""
-    _, frames, reference = flight
-    tracker = Tracker([reference])
-    for frame in frames[:4]:
-        tracker.feed(frame)
+    frames, tracker = flight[1], followed(flight[1][:4], flight[2])
     assert not tracker.is_lost
     (news,) = tracker.feed(replace(frames[8], motion=frames[4].motion))
     (row,) = make_rows([news])
@@ -87,10 +89,7 @@ def test_a_frame_that_contradicts_its_motion_may_be_anywhere_and_is_not_sent(fli
 
 
 def test_without_motion_a_flight_is_lost(flight):
-    _, frames, reference = flight
-    tracker = Tracker([reference])
-    for frame in frames:
-        tracker.feed(frame)
+    frames, tracker = flight[1], followed(*flight[1:])
     news = tracker.feed(FlightFrame(9, "9", 9.0, frames[8].mask))
     assert [one.status for one in news] == ["lost"]
 

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
+from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of, search
 
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.scene import query_neighbours
-from roadgeo.matching.search import Search, SearchOptions, search, search_together
+from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.triples import WITHOUT_ROADS, Sweep, TripleOptions
 
 ACCEPT = SearchOptions().accept
@@ -19,7 +19,7 @@ ACCEPT = SearchOptions().accept
 
 def locate(scene, index, options=None, near=None, limits=None):
     estimator = TripleEstimator(scene, index, options, near)
-    return search(estimator, limits or SearchOptions(time_limit_s=60.0)), estimator
+    return search(estimator, limits), estimator
 
 
 def gap(result, truth, scene):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
+from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of, search
 
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import road_search
@@ -24,7 +24,7 @@ from roadgeo.matching.road_search import (
     ring_of,
     scales,
 )
-from roadgeo.matching.search import SearchOptions, search
+from roadgeo.matching.search import SearchOptions
 from roadgeo.matching.triples import WITHOUT_ROADS
 
 SCALE = (0.2, 5.0)
@@ -220,7 +220,7 @@ def test_distances_lie_in_rings():
 
 def test_a_map_of_few_roads(broken):
     index = build_index(random_network(7, 400.0))
-    result = search(TripleEstimator(broken, index, MatchOptions()), SearchOptions(time_limit_s=60.0))
+    result = search(TripleEstimator(broken, index, MatchOptions()))
     assert result.score < 2.5
 
 

@@ -164,4 +164,4 @@ def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     options = MatchOptions(without_roads=(Sweep(TripleOptions(), 1),), roads=False)
     parts = search_all(stranger, indexes, options)
     assert sum(part.estimator.n_screened for part in parts) <= 3 * 50
-    assert sum(part.n_scored for part in parts) <= 3 * growing.MAX_VERIFIED
+    assert sum(part.estimator.n_verified for part in parts) <= 3 * growing.MAX_VERIFIED

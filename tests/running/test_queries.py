@@ -64,9 +64,28 @@ def offset(document: dict, size: int = 1) -> float:
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
 
 
+#: What a photograph shows that shows no roads.
+NOTHING = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, int]]:
+    """Scales at which photographs are shown to models, with the number of ways; nothing is seen."""
+    taken: list[tuple[float, int]] = []
+
+    def note(
+        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
+    ) -> ProbabilityMap:
+        taken.append((round(scale, 1), ways))
+        return NOTHING
+
+    monkeypatch.setattr(photographs, "segment", note)
+    return taken
+
+
 @pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
 def test_the_second_look_shows_the_photograph_more_ways(
-    segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch
+    segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, shown: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[str] = []
 
@@ -74,9 +93,7 @@ def test_the_second_look_shows_the_photograph_more_ways(
         taken.extend(look.note for look in looks)
         raise MaskError("that is all")
 
-    nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
     monkeypatch.setattr(photographs, "locate_looks", note)
-    monkeypatch.setattr(photographs, "segment", lambda *_, **__: nothing)
     names = tuple(model if name == "model" else name for name in segmenters)
     mask = RoadMask(np.zeros((10, 10), np.bool_))
     monkeypatch.setattr(photographs, "call_segmenter", lambda *_: mask)
@@ -99,37 +116,20 @@ def test_the_second_look_shows_the_photograph_more_ways(
 
 @pytest.mark.parametrize(("ways", "expected"), [(1, [(0.5, 1)]), (2, [(1.0, 1), (0.5, 1)])])
 def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
-    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch, ways: int, expected: list[tuple[float, int]]
+    tmp_path: Path, photo: Path, shown: list[tuple[float, int]], ways: int, expected: list[tuple[float, int]]
 ) -> None:
     props = {"class_names": {0: "ground", 1: "road"}, "ways": ways}
     model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
-    shown: list[tuple[float, int]] = []
-
-    def note(
-        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
-    ) -> ProbabilityMap:
-        shown.append((round(scale, 1), ways))
-        return ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
-
-    monkeypatch.setattr(photographs, "segment", note)
     queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenters=(str(model),)))
     assert shown == expected
 
 
 def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
-    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, photo: Path, shown: list[tuple[float, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     props = {"class_names": {0: "ground", 1: "road"}, "ways": 2}
     model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
-    shown: list[tuple[float, int]] = []
     taken: list[str] = []
-    nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
-
-    def note(
-        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
-    ) -> ProbabilityMap:
-        shown.append((round(scale, 1), ways))
-        return nothing
 
     def take(looks, see, *_):  # type: ignore[no-untyped-def]
         for look in looks:
@@ -138,9 +138,8 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
                 see(look)
         raise MaskError("that is all")
 
-    monkeypatch.setattr(photographs, "segment", note)
     monkeypatch.setattr(photographs, "locate_looks", take)
-    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: NOTHING, 1.0: None, 2.0: None})
     locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenters=(str(model),)))
     assert taken == ["0", "1", "2", "0, a lower threshold"]
     # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
@@ -148,21 +147,11 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
 
 
 def test_a_scale_that_was_tried_alone_is_not_shown_finer(
-    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, photo: Path, shown: list[tuple[float, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was seen at the finest scale that is worth a look goes with the coarser one; a finer one would be dear."""
     model = brightness_model(tmp_path / "light.onnx", size=256, props={"ways": 2})
-    shown: list[tuple[float, int]] = []
-    seen = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
-
-    def note(
-        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
-    ) -> ProbabilityMap:
-        shown.append((scale, ways))
-        return seen
-
-    monkeypatch.setattr(photographs, "segment", note)
-    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: seen, 0.25: seen, 0.125: seen})
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: dict.fromkeys((0.5, 0.25, 0.125), NOTHING))
     reading = ReadOptions(segment="always", segmenters=(str(model),))
     with photographs.open_frame([str(photo)], reading, (0.0, np.inf), lambda *_: None) as frame:
         for look in frame.looks():

@@ -9,12 +9,13 @@ from scipy.spatial import Delaunay
 
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.scene import Scene, prepare_scene
+from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
 from worlds.drawn import camera, mapped
 
-__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of", "soft"]
+__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of", "search", "soft"]
 
 PLANE = LocalPlane("EPSG:32619", (330000.0, 4690000.0))
 
@@ -159,3 +160,10 @@ def soft(scene, strength=1.0, seed=0):
     odds = strength * (4.0 - 0.5 * away_m + 4.0 * noise)
     probability = np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -5.0, 5.0))), np.float32)
     return replace(scene, probability=probability)
+
+
+def search(estimator, limits: SearchOptions | None = None) -> Search:
+    """Search one part alone, within a minute."""
+    alone = Search(estimator)
+    search_together([alone], limits or SearchOptions(time_limit_s=60.0))
+    return alone
