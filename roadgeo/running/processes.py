@@ -139,7 +139,7 @@ _prepared: list[Callable[[Any], Any]] = []
 def _start_worker(work: Work[Any, Any]) -> None:
     """Make a worker ready. Ctrl-C is the parent's to handle: it ends the workers, which clean up as they go."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _exit)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
         end_with_parent()
         import cv2
@@ -157,12 +157,8 @@ def _do(task: Any) -> Any:
         _leave()
 
 
-def _exit(*_: object) -> NoReturn:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
-    sys.exit()
-
-
 def _leave() -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
     remove_own()
     os._exit(128 + signal.SIGTERM)
 
