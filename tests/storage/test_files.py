@@ -53,9 +53,10 @@ def test_nothing_is_left_when_writing_fails(tmp_path: Path, error: type[BaseExce
 def test_an_interrupt_while_a_folder_is_made_or_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(at, Mock(side_effect=KeyboardInterrupt))
-        write_text(tmp_path / "a.txt", "whole")
+        with pytest.raises(KeyboardInterrupt):
+            write_text(tmp_path / "a.txt", "whole")
     assert list(tmp_path.glob(".*"))
     files.remove_own()  # as a process does that ends
     assert not list(tmp_path.glob(".*"))
