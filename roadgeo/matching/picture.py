@@ -45,7 +45,7 @@ _ROAD_M = 8.0
 #: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
 #: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
 _STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 250.0, 500.0, 0.2
-#: Greatest log10 likelihood of which the part counts that a rival lacks.
+#: A greater log10 likelihood counts as this one (see `Picture.lead`).
 _MOST_WORTH = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
@@ -118,7 +118,7 @@ class Picture:
         """Return the log10 lead of a place over a rival, from the log10 L of each.
 
         In a grid that resembles its mirror image, a wrong place leads by a constant part of its likelihood, and so by
-        more the larger the frame. Of likelihoods beyond `_MOST_WORTH` only the part that the rival lacks counts.
+        more the larger the frame. A likelihood beyond `_MOST_WORTH` counts by the part that the rival lacks.
         """
         return (worth - max(rival, 0.0)) * min(1.0, _MOST_WORTH / max(worth, 1e-9))
 
