@@ -19,14 +19,14 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, RoadSourceError
-from roadgeo.flights.pose import FEWEST, MIN_COS, FilterOptions, correct, start
+from roadgeo.flights.pose import FEWEST, FilterOptions, correct, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.index import bucket_roads
-from roadgeo.matching.scene import Scene, trace_query
+from roadgeo.matching.index import bucket_roads, neighbour_grid
+from roadgeo.matching.scene import MIN_COS, Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion"]
@@ -41,6 +41,8 @@ _ROUGH_SIDE, _TURNS_DEG, _FARTHEST = 96, (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0
 
 #: How far a rough motion may be off: shift in pixels of the rough grid, turn, scale and the rest as shares of a frame.
 _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
+#: Side of the buckets in which roads of a mask are looked up.
+_BUCKET_PX = 32.0
 #: The least share of road points in the overlap that must lie on roads of the other mask.
 _LEAST_SHARE = 0.6
 #: Frames in no order are laid on each other where they share this part: less agrees by chance.
@@ -152,14 +154,19 @@ class Odometer:
 
 
 class _Laid(NamedTuple):
-    """A mask laid on another: how, the share of roads that agree, and of the frame that both see.
+    """A mask laid on another: how, the shares of either's roads that agree, and of the frame that both see.
 
     Where frames share less, less can disagree: the quality is the agreement, times the root of the shared part.
     """
 
     motion: FloatArray
-    agreement: float
+    there: float
+    back: float
     shared: float
+
+    @property
+    def agreement(self) -> float:
+        return 0.5 * (self.there + self.back)
 
     @property
     def fit(self) -> float:
@@ -210,12 +217,18 @@ def _steadiest(laid: Sequence[_Laid], last: FloatArray, frame: Frame) -> FloatAr
 
 def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Laid | None:
     """Lay a mask on another, near a rough motion; None where they hardly share a road."""
-    found = _refine(guess, frame, other.scene, first.roads)
-    if found is None:
+    corners = Homography(guess).facing(frame.center)(frame.corners)
+    if not np.isfinite(corners).all():
         return None
-    there, motion = found
+    pose = start(corners * (1.0, -1.0), frame, _rough_covariance(frame))
+    placed = correct(pose, other.scene, first.roads, _FILTER)
+    if placed is None:
+        return None
+    motion = PIXEL_TO_PLANE @ placed.homography.matrix
+    motion = np.asarray(motion / motion[2, 2])
+    there = _agreement(motion, frame, other.scene, first.roads)
     back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, first.scene, other.roads)
-    return _Laid(motion, 0.5 * (there + back), _shared(motion, frame))
+    return _Laid(motion, there, back, _shared(motion, frame))
 
 
 @dataclass(frozen=True)
@@ -249,20 +262,17 @@ def overlay(first: TracedMask, other: TracedMask) -> list[tuple[FloatArray, floa
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    found: list[tuple[FloatArray, float]] = []
+    laid: list[_Laid | None] = []
     for turn in (np.eye(3), _half_turn(frame)):
         seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
-        for guess in _rough_motions(first.mask, seen, 4):
-            laid = _refine(guess @ turn, frame, other.scene, first.roads)
-            if laid is None or laid[0] < _LEAST_SHARE:
-                continue
-            back = _agreement(np.asarray(np.linalg.inv(laid[1]), float), frame, first.scene, other.roads)
-            shared = _shared(laid[1], frame)
-            if back >= _LEAST_SHARE and shared >= _LEAST_SHARED:
-                found.append((laid[1], min(laid[0], back) * shared))
-    found.sort(key=lambda pair: -pair[1])
+        laid += [_lay(guess @ turn, frame, first, other) for guess in _rough_motions(first.mask, seen, 4)]
+    overlaps = [
+        (found.motion, min(found.there, found.back) * found.shared)
+        for found in laid
+        if found is not None and min(found.there, found.back) >= _LEAST_SHARE and found.shared >= _LEAST_SHARED
+    ]
     distinct: list[tuple[FloatArray, float]] = []
-    for motion, sure in found:
+    for motion, sure in sorted(overlaps, key=lambda pair: -pair[1]):
         if not any(_is_same_motion(motion, known, frame) for known, _ in distinct):
             distinct.append((motion, sure))
     return distinct[:3]
@@ -285,19 +295,6 @@ def _otherwise(motion: FloatArray, last: FloatArray, frame: Frame) -> float:
     return float(np.hypot(*(moved - before)) / max(frame.width, frame.height))
 
 
-def _refine(guess: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> tuple[float, FloatArray] | None:
-    """Lay a mask on the roads of the one before, near a rough motion; return how well they agree, and the motion."""
-    corners = Homography(guess).facing(frame.center)(frame.corners)
-    if not np.isfinite(corners).all():
-        return None
-    pose = start(corners * (1.0, -1.0), frame, _rough_covariance(frame))
-    placed = correct(pose, scene, roads, _FILTER)
-    if placed is None:
-        return None
-    motion = np.diag([1.0, -1.0, 1.0]) @ placed.homography.matrix
-    return _agreement(motion, frame, scene, roads), np.asarray(motion / motion[2, 2])
-
-
 def _rough_covariance(frame: Frame) -> FloatArray:
     """Return how unsure a rough motion is: (8, 8) of the corners, which mostly shift, turn and grow together."""
     unit = frame.half_diagonal
@@ -314,7 +311,7 @@ def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBucket
     inside = np.asarray(((pixels > 0) & (pixels < (frame.width, frame.height))).all(axis=1))
     if inside.sum() < 0.1 * len(inside) or inside.sum() < FEWEST:
         return 0.0
-    matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
+    matrix = PIXEL_TO_PLANE @ motion @ PIXEL_TO_PLANE
     points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
     radii, ways = np.full(len(points), 6.0), np.empty((len(points), 3))
     return road_residuals(matrix, points, along, radii, MIN_COS, roads, ways) / len(points)
@@ -324,17 +321,11 @@ def _buckets(graph: RoadGraph) -> RoadBuckets:
     """Sort the roads of a traced mask into buckets, so that they can be looked up like a map's."""
     parts = [np.hstack([line[:-1], line[1:]]) for line in graph.polylines()]
     segments = np.ascontiguousarray(np.concatenate(parts), np.float32)
-    ends = segments.reshape(-1, 2)
-    low, size = ends.min(axis=0), 32.0
-    columns, rows = (int(side / size) + 1 for side in ends.max(axis=0) - low)
-    return bucket_roads(segments, (float(low[0]), float(low[1]), size), (columns, rows))
+    return bucket_roads(segments, *neighbour_grid(segments.reshape(-1, 2).astype(float), _BUCKET_PX))
 
 
-def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[FloatArray]:
-    """Return the shifts at which the roads of two masks cover each other most: the best ones, each of another turn.
-
-    The two best shifts of each turn are among them.
-    """
+def _rough_motions(before: RoadMask, mask: RoadMask, count: int) -> list[FloatArray]:
+    """Return the shifts at which the roads of two masks cover each other most, of the two best of each turn."""
     height, width = mask.shape
     scale = _ROUGH_SIDE / max(height, width)
     size = (round(width * scale), round(height * scale))
@@ -354,7 +345,7 @@ def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[Flo
         angle = math.radians(degrees)
         # OpenCV's angles turn counterclockwise as seen, in pixels with rows downwards.
         rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        for _ in range(1 if count <= 2 else 2):
+        for _ in range(2):
             row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
             shift = np.array([columns[column], rows[row]]) / scale
             motion = np.eye(3)

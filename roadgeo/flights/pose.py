@@ -20,15 +20,15 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import USUAL_FOCAL, USUAL_SIGMA
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["FEWEST", "MIN_COS", "FilterOptions", "Pose", "correct", "predict", "start"]
+__all__ = ["FEWEST", "FilterOptions", "Pose", "correct", "predict", "start"]
 
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
-#: With fewer road points on roads a frame is not corrected; roads count that run the point's way, within this angle.
-FEWEST, MIN_COS = 20, math.cos(math.radians(25.0))
+#: With fewer road points on roads a frame is not corrected.
+FEWEST = 20
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Pose:
     @property
     def gsd_m(self) -> float:
         """Metres per pixel in the middle of the frame."""
-        return math.sqrt(abs(float(np.linalg.det(self.homography.jacobian(self.frame.center)))))
+        return math.sqrt(abs(self.homography.area_scale(*self.frame.center.tolist())))
 
     @property
     def sigma_m(self) -> float:

@@ -20,7 +20,7 @@ from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, Look
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
 from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -270,7 +270,7 @@ class Tracker:
         """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape
-        shrunk = [_scale(matrix, Frame(width, height)) for matrix in mosaic.to_mosaic]
+        shrunk = [sampling(matrix @ PIXEL_TO_PLANE, (width, height)) for matrix in mosaic.to_mosaic]
         if camera.gsd_m != CameraOptions().gsd_m:
             camera = replace(camera, gsd_m=(camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)))
         camera = replace(camera, focal_px=None)  # a mosaic is no picture by one camera
@@ -371,11 +371,6 @@ def _read(mosaic: Mosaic) -> Query | None:
         return read_query(mosaic.mask)
     except MaskError:
         return None
-
-
-def _scale(matrix: FloatArray, frame: Frame) -> float:
-    """Return how many pixels of a mosaic a frame's pixel is wide, in its middle."""
-    return math.sqrt(abs(float(np.linalg.det(Homography(matrix).jacobian(frame.center)))))
 
 
 def _odds(pose: Pose, scene: Scene, reference: Reference) -> float:
