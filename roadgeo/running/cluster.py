@@ -14,7 +14,7 @@ import pickle
 import uuid
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError, Future, wait
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -121,19 +121,21 @@ def _local_cluster(workers: int) -> Iterator[Any]:
 
 def _in_order(client: Any, made: Made, tasks: Sequence[Any]) -> Iterator[Any]:
     """Yield the results of tasks in order."""
+    from distributed import wait
     from distributed.scheduler import KilledWorker
 
-    pool, waiting = client.get_executor(pure=False), iter(tasks)
-    under_way: deque[Future[Any]] = deque()
+    # Dask's executor fails where a worker dies that holds a result that was just read.
+    waiting, under_way = iter(tasks), deque[Any]()
     try:
         while True:
             room = _AHEAD * len(client.nthreads()) + 1 - len(under_way)  # workers come and go
-            under_way += [pool.submit(do_prepared, made, task) for task in islice(waiting, max(room, 0))]
+            under_way += [client.submit(do_prepared, made, task, pure=False) for task in islice(waiting, max(room, 0))]
             if not under_way:
                 return
             yield under_way.popleft().result()
     except KilledWorker:
-        wait(under_way)  # the scheduler blames all that a dead worker had before it: nothing runs beside the suspect
+        with contextlib.suppress(CancelledError):
+            wait(list(under_way))  # the scheduler blames all that a dead worker had: nothing runs beside the suspect
         raise
     except (CancelledError, OSError) as error:
         raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error

@@ -37,8 +37,6 @@ from roadgeo.running.cluster import Cluster, Made, do_prepared
 from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.matching.options import LocateOptions
     from roadgeo.matching.parts import Part
@@ -124,29 +122,28 @@ def _locate(
     limits = replace(options.search, time_limit_s=max(options.search.time_limit_s - query.seconds.vectorize, 0.0))
     options, workers = replace(options, search=limits), sorted(client.nthreads()) or [""]
 
-    def search(worker: str, parts: Sequence[str], options: LocateOptions) -> Future[_Answer]:
-        here = sum(sizes[name] for name in parts)
-        against = 2.0 * math.log10(larger(sum(sizes.values())) / larger(here))  # as in `Rivals`, for the whole map
-        pool = client.get_executor(pure=False, workers=[worker], allow_other_workers=True)
-        future: Future[_Answer] = pool.submit(do_prepared, made, query, parts, options, against)
-        return future
-
-    def search_all(options: LocateOptions) -> list[_Answer]:
-        futures = [search(worker, parts, options) for worker, parts in owners(list(sizes), workers).items()]
+    def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> list[_Answer]:
+        futures = []
+        for worker, parts in searched.items():
+            here = sum(sizes[name] for name in parts)
+            against = 2.0 * math.log10(larger(sum(sizes.values())) / larger(here))  # as in `Rivals`, for the whole map
+            how = {"pure": False, "workers": [worker], "allow_other_workers": True}
+            futures.append(client.submit(do_prepared, made, query, parts, options, against, **how))
         return [future.result() for future in futures]
 
+    all_parts = owners(list(sizes), workers)
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
     try:
-        answers = search_all(replace(options, effort="quick", search=least_work))
+        answers = search(all_parts, replace(options, effort="quick", search=least_work))
         if not any(answer.location.located for answer in answers):
-            answers = search_all(options)
+            answers = search(all_parts, options)
         best = max(answers, key=_rank)
         if best.location.status == "not_located":
             return _refused_by_all(best.location, [answer.location for answer in answers], references)
         places = sorted((place for answer in answers for place in answer.places), reverse=True)
         # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
         chosen = list(dict.fromkeys(part for _, part in places)) or best.parts
-        return search(next(iter(owners(chosen[:1], workers))), chosen, options).result().location
+        return search({next(iter(owners(chosen[:1], workers))): chosen}, options)[0].location
     except (CancelledError, OSError) as error:
         raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
     except Exception as error:

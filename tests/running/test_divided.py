@@ -135,10 +135,7 @@ class Slow:
     def nthreads(self):
         return {"tcp://one": 1}
 
-    def get_executor(self, **_):
-        return self
-
-    def submit(self, do, made, query, parts, options, against):
+    def submit(self, do, made, query, parts, options, against, **_):
         time.sleep(0.3)
         self.limits.append(options.search.time_limit_s)
         future = Future()
