@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, uniform_filter
 from worlds.scenes import Sight, camera, look, scene_of, soft
 
 from roadgeo.geometry.homography import Homography
@@ -21,11 +21,15 @@ def scene(town):
     return scene_of(look(town[0], TRUTH, SIZE, Sight(1.0, missing=0.1, false=0.05)), SIZE)
 
 
-def naive_weigh(picture, matrix):
-    """Add up the formula of the module cell by cell, as log10."""
+def naive_weigh(picture, matrix, usual_m=300.0):
+    """Add up the formula of the module cell by cell, as log10; pixels of the picture are 1 m wide."""
     scene, cell_m = picture.scene, 4.0
     p, scale = scene.probability, scene.field_scale
     usual = p.mean()
+    side = 2 * round(usual_m / scale / 2) + 1
+    nearby = uniform_filter(p.astype(float), side, mode="constant") / uniform_filter(np.ones(p.shape), side, mode="constant")
+    odds = p / (1.0 - p) * (1.0 - nearby) / nearby * usual / (1.0 - usual)
+    p = odds / (1.0 + odds)
     corners = Homography(matrix).everywhere(scene.corners)
     low = corners.min(axis=0)
     ground = pictures.draw_roads(picture.index, low, corners.max(axis=0), cell_m)
@@ -52,6 +56,19 @@ def test_it_adds_up_what_the_formula_says_of_each_cell(town, scene):
     for east in (0.0, 40.0, 300.0):
         matrix = shifted(TRUTH, east, 0.0)
         assert picture.weigh(matrix) == pytest.approx(naive_weigh(picture, matrix), abs=0.4)
+
+
+def test_what_is_usual_is_what_is_usual_within_some_300_m(town, scene):
+    """A town beside fields: with one mean for all of it, any dense roads under the town would gain."""
+    seen = soft(scene, 0.4)
+    cells = np.arange(seen.probability.shape[1]) * seen.field_scale
+    clutter = 0.25 * (1.0 + np.sin(cells / 350.0 * 2.0 * np.pi))
+    p = (1.0 - (1.0 - seen.probability) * (1.0 - clutter)).astype(np.float32)
+    picture = Picture(replace(seen, probability=p), town[1], 1.0)
+    worth, by_side = picture.weigh(TRUTH), {m: naive_weigh(picture, TRUTH, m) for m in (150.0, 300.0, 600.0)}
+    assert worth == pytest.approx(by_side[300.0], abs=0.4)
+    assert worth != pytest.approx(by_side[150.0], abs=0.4)
+    assert worth != pytest.approx(by_side[600.0], abs=0.4)
 
 
 @pytest.mark.parametrize("strength", [None, 1.0, 0.4], ids=["drawn", "soft", "weak"])
