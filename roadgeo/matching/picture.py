@@ -40,10 +40,10 @@ _FALSE = np.array([0.1, 0.3, 0.6, 1.0])
 _FINE, _SUREST = 16.0, 5.5
 #: Probabilities of a drawn mask on its roads and elsewhere; half the width of a road, and how far its edge is blurred.
 _DRAWN, _HALF_ROAD_M, _BLUR_M = (0.98, 0.02), 5.0, 1.5
-#: Side of the ground over which the usual probability of road is taken, metres. A frame of some kilometres shows town and
-#: field: with one for all of it, any dense roads under the town gain. Five crops of 1.6 to 3.2 km, truth and best wrong
-#: place: 116 and 114, 95 and 45, 56 and 186, 60 and 146, 35 and 9 with one for all; 100 and 31, 73 and 6, 40 and 100, 56
-#: and 120, 31 and 9 with 1,200 m; 84 and 8, 63 and 1, 26 and 24, 48 and 18, 26 and 6 with 300 m.
+#: Side of the ground over which the usual probability of road is taken, metres. A frame of some kilometres shows town
+#: and field: with one for all of it, any dense roads under the town gain. Five crops of 1.6 to 3.2 km, truth and best
+#: wrong place: 116 and 114, 95 and 45, 56 and 186, 60 and 146, 35 and 9 with one for all; 100 and 31, 73 and 6, 40 and
+#: 100, 56 and 120, 31 and 9 with 1,200 m; 84 and 8, 63 and 1, 26 and 24, 48 and 18, 26 and 6 with 300 m.
 _USUAL_M = 300.0
 #: Width of the map's roads, as they are drawn, metres.
 _ROAD_M = 8.0

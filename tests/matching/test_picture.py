@@ -27,7 +27,8 @@ def naive_weigh(picture, matrix, usual_m=300.0):
     p, scale = scene.probability, scene.field_scale
     usual = p.mean()
     side = 2 * round(usual_m / scale / 2) + 1
-    nearby = uniform_filter(p.astype(float), side, mode="constant") / uniform_filter(np.ones(p.shape), side, mode="constant")
+    sums, counts = (uniform_filter(cells, side, mode="constant") for cells in (p.astype(float), np.ones(p.shape)))
+    nearby = sums / counts
     odds = p / (1.0 - p) * (1.0 - nearby) / nearby * usual / (1.0 - usual)
     p = odds / (1.0 + odds)
     corners = Homography(matrix).everywhere(scene.corners)
