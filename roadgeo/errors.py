@@ -63,8 +63,6 @@ class Reason(StrEnum):
     NOTHING_STANDS_OUT = "nothing_stands_out"
     #: Something did, but not by enough for all the looks that were taken.
     TOO_MANY_LOOKS = "too_many_looks"
-    #: Turned over, left to right, it would be located.
-    MIRRORED = "mirrored"
     #: The mask, the photograph or what goes with it cannot be read or used; a result cannot be written.
     INVALID = "invalid"
     NOT_WRITTEN = "not_written"

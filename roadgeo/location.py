@@ -266,7 +266,7 @@ class Location:
     query_to_pixel : (3, 3) float64 or None
         For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
     mirrored : bool
-        The mask has this place turned over only, left to right: the homography mirrors.
+        What was given is mirrored, by the user's or its file's word: the homography mirrors.
     part_read : str
         What was read of a file that holds more: "band 2 (road) of 3", "page 1 of 2"; "" where that is all.
     stated_offset_m : float or None

@@ -19,7 +19,6 @@ from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.options import (
-    ASPECT,
     IMAGE,
     RESULTS,
     SEARCH,
@@ -117,12 +116,12 @@ def _more() -> str:
 
 _OPTIONS = (
     take("references", *HINTS),
-    row("--allow-mirror", "", IMAGE,
-        "Where an image has no place, turn it over: film scanned from its back. Without it, that is only told.",
-        rare=True),
-    row("--aspect", "RATIO|unknown", IMAGE,
-        "How many times a pixel is as wide as high, of scans that are stretched; unknown: from 0.5 to 2 is tried.",
-        type=ASPECT, rare=True),
+    row("--mirror/--no-mirror", "", IMAGE,
+        "The image is mirrored (film scanned from its back), or is not. Default: as its file says.",
+        default=None, rare=True),
+    row("--aspect", "RATIO", IMAGE,
+        "How many times a pixel is as wide as high, of scans that are stretched. Default: as the file says, or 1.",
+        type=click.FloatRange(0.25, 4.0), rare=True),
     row("--dem", "FILE", IMAGE,
         "Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
         default="", type=click.Path(), rare=True),
@@ -151,7 +150,7 @@ _OPTIONS = (
     row("--max-pixels", "N", RESULTS,
         "Draw coarser rather than more than this.",
         type=click.IntRange(1), default=400_000_000, show_default=True, rare=True),
-    take("recursive", "segmenting", "fuse", "mask_values"),
+    take("recursive", "segmenting", "mask_values"),
     row("--units", ("auto", "pixels", "metres"), IMAGE,
         "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
         default="auto", show_default=True, rare=True),
@@ -187,7 +186,7 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
     options = make_options(hinted(given), given["method"])
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]), take=given["take"])
     outputs = _output_options(given)
-    tasks, others = find_tasks(masks, given, out_dir)
+    tasks = find_tasks(masks, given, out_dir)
     cluster = make_cluster(given, jobs)
     if given["divide_map"] and (cluster is None or given["method"] == "pair" or given["explain"]):
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
@@ -198,7 +197,7 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
     asked = BatchOptions(
         options,
         outputs,
-        read_options(given, others, jobs),
+        read_options(given, jobs),
         images=photos,
         exif=given["focal_px"] == "exif",
         dem=given["dem"],

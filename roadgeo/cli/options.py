@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from roadgeo.cli.printing import echo, keep_switch
-from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_numbers, read_place, read_range
+from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_place, read_range
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from roadgeo.running.tasks import Task
 
 __all__ = [
-    "ASPECT",
     "BOX",
     "CRS",
     "GSD",
@@ -265,16 +264,6 @@ def _read_bands(text: str) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def _read_aspect(text: str) -> float | str:
-    if text == "unknown":
-        return text
-    form = "a number from 0.25 to 4, or unknown"
-    (ratio,) = read_numbers(text, form, (1,))
-    if not 0.25 <= ratio <= 4.0:
-        raise ValueError(f"got {text!r}, expected {form}")
-    return ratio
-
-
 def _read_crs(text: str) -> str:
     from roadgeo.storage.crs import name_crs
 
@@ -288,7 +277,7 @@ RANGE, GSD, NEAR, BOX = (
     Read("near", read_place),
     Read("box", read_box),
 )
-ASPECT, CRS = Read("aspect", _read_aspect), Read("CRS", _read_crs)
+CRS = Read("CRS", _read_crs)
 
 
 # --- options that commands share --------------------------------------------------------------------------------------
@@ -331,14 +320,12 @@ _SHARED = {
         "Compression of rasters. jpeg and webp, for photographs only, make them five times smaller, with some loss.",
         default="deflate", show_default=True, rare=True),
     "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
-    "segmenters": row("--segmenter segmenters", "NAME|MODEL.onnx", IMAGE,
+    "segmenter": row("--segmenter", "NAME|MODEL.onnx", IMAGE,
         "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness, GeoDeep "
-        "or STAC describe them. Several are fused. Default: the model that ships.",
-        type=Plugin(partial(installed, "roadgeo.segmenters"), file_ending=".onnx"), multiple=True, rare=True),
+        "or STAC describe them. Default: the model that ships.",
+        type=Plugin(partial(installed, "roadgeo.segmenters"), file_ending=".onnx"), rare=True),
     "class_name": row("--class class_name", "NAME|N", IMAGE,
         "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True),
-    "fuse": row("--fuse", "", IMAGE,
-        "All images show one frame (exposures, masks of several models): fuse them.", rare=True),
     "threshold": row("--threshold", "T", IMAGE,
         "Values above T are road; of photographs, probabilities. Default: by the values.", type=float, rare=True),
     "band": row("--band", "N", IMAGE,
@@ -362,7 +349,7 @@ _SHARED = {
 
 #: Several that go together.
 _TOGETHER = {
-    "segmenting": ("segment", "segmenters", "class_name"),
+    "segmenting": ("segment", "segmenter", "class_name"),
     "mask_values": ("threshold", "band", "bands"),
     "cluster": ("engine", "scheduler"),
     "verbosity": ("quiet", "verbose"),
@@ -409,10 +396,8 @@ def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOption
     return apply_hints(replace(LocateOptions(), method=method), known)
 
 
-def find_tasks(
-    images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None
-) -> tuple[list[Task], list[str]]:
-    """Return a task for each image that is named; with --fuse for the first, and the others, which belong to it.
+def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None) -> list[Task]:
+    """Return a task for each image that is named.
 
     Raises
     ------
@@ -425,8 +410,7 @@ def find_tasks(
     found = [name_page(name, given.get("page")) for name in find_masks(images, given["recursive"])]
     if not found:
         raise click.UsageError(f"No images in {', '.join(images)}.")
-    n = 1 if given["fuse"] else len(found)
-    return name_tasks(found[:n], out_dir), found[n:]
+    return name_tasks(found, out_dir)
 
 
 def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = None) -> list[AnyReference]:
@@ -458,15 +442,14 @@ def n_threads(jobs: int = 1) -> int:
     return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
 
 
-def read_options(given: Mapping[str, Any], others: Sequence[str] = (), jobs: int = 1) -> ReadOptions:
-    """Put together how what is given is read; `others` are fused with each query."""
+def read_options(given: Mapping[str, Any], jobs: int = 1) -> ReadOptions:
+    """Put together how what is given is read."""
     from dataclasses import fields
 
     from roadgeo.running.options import ReadOptions
 
     known = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) is not None}
-    mirror = "allow" if given.get("allow_mirror") else "tell"
-    return ReadOptions(**{**known, "fused_with": tuple(others), "threads": n_threads(jobs), "mirror": mirror})
+    return ReadOptions(**{**known, "threads": n_threads(jobs)})
 
 
 def make_cluster(given: Mapping[str, Any], jobs: int) -> Cluster | None:

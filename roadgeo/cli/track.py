@@ -115,8 +115,7 @@ _OPTIONS = (
         "Time between images. Default: 1.", type=click.FloatRange(min=0), default=1.0, rare=True),
     row("--start", "TIME", FLIGHT, "When the first frame was taken.", type=TIME),
     take("segment", "class_name", "mask_values"),
-    take("segmenters", multiple=False, default="", metavar="MODEL.onnx", type=click.Path(),
-        help="Who finds the roads."),
+    take("segmenter", metavar="MODEL.onnx", type=click.Path(), help="Who finds the roads."),
     take("time_limit", group=FLIGHT, default=10.0, help="Stop each search then. Default: 10."),
     take("recursive", group=FLIGHT, rare=True),
     take("verbosity"),
@@ -198,9 +197,8 @@ def _frame_options(given: dict[str, Any]) -> FrameOptions:
     from roadgeo.flights.frames import FrameOptions
     from roadgeo.flights.motion import read_motion
 
-    segmenters = (given["segmenters"],) if given["segmenters"] else ()
     return FrameOptions(
-        reading=read_options({**given, "segmenters": segmenters}),
+        reading=read_options(given),
         gsd_m=given["gsd_m"],
         motion=None if given["motion"] is None else read_motion(given["motion"]),
         motion_px=given["motion_sigma"],

@@ -61,7 +61,7 @@ _OPTIONS = (
     row("--max-turn", "DEG", OTHERS,
         "By how much it may be turned.", type=click.FloatRange(0, 45), default=6.0, show_default=True, rare=True),
     take("crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE),
-    take("recursive", "segmenting", "fuse", "mask_values", "jobs", "verbosity"),
+    take("recursive", "segmenting", "mask_values", "jobs", "verbosity"),
 )  # fmt: skip
 
 
@@ -96,8 +96,8 @@ def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: An
     from roadgeo.outputs.verification_files import write_table
     from roadgeo.running.processes import run
 
-    tasks, others = find_tasks(images, given)
-    settings = _settings(given, others, jobs)
+    tasks = find_tasks(images, given)
+    settings = _settings(given, jobs)
     opened = open_maps(settings.references)
     if given["fix"] or given["report"] or len(tasks) > 1:
         make_folder(out_dir)
@@ -118,7 +118,7 @@ def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: An
     return ERROR if counts["error"] else OFF if counts["off"] else NOT_LOCATED if counts["unknown"] else 0
 
 
-def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
+def _settings(given: dict[str, Any], jobs: int) -> VerifyRun:
     """Put together what was asked."""
     from roadgeo.matching.checking import CheckOptions
     from roadgeo.running.verifying import VerifyRun
@@ -126,7 +126,7 @@ def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
     usual = CheckOptions()
     search = replace(usual.search, reach_m=given["reach"], turn_deg=given["max_turn"])
     options = replace(usual, tolerance_m=given["tolerance"], search=search)
-    return VerifyRun(given["references"], options, read_options(given, others, jobs), given["crs"])
+    return VerifyRun(given["references"], options, read_options(given, jobs), given["crs"])
 
 
 def _write_page(

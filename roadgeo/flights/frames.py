@@ -239,7 +239,7 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
     from roadgeo.sources.segmentation.tiling import segment
 
     reading = options.reading
-    network = load_model(*reading.segmenters[:1], class_name=reading.class_name, threads=reading.threads)
+    network = load_model(reading.segmenter, reading.class_name, reading.threads)
     with open_photograph(image.path, reading.bands) as photograph:
         if last.scale is None:
             known = options.gsd_m

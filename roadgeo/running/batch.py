@@ -198,8 +198,7 @@ class Locating:
             return ""
         photo = self.options.images.get(task.mask)
         drawn = [f"--image={photo}"] if photo else []
-        fused = self.options.reading.fused_with
-        return shlex.join(["roadgeo", "locate", task.query, *fused, *drawn, *self.options.command])
+        return shlex.join(["roadgeo", "locate", task.query, *drawn, *self.options.command])
 
     def _changes(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, as plain values for the JSON."""

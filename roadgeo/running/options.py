@@ -27,25 +27,23 @@ class ReadOptions:
         The band that holds a mask, counted from 1.
     segment : "auto", "always" or "never"
         Whether photographs are recognised, everything is taken for one, or nothing.
-    segmenters : tuple of str
-        Plugins, and files of models (.onnx); several are fused. Default: the model that ships.
+    segmenter : str
+        A plugin, or the file of a model (.onnx). Default: the model that ships.
     class_name : str or None
         The class of a model that is road, or the number that stands for road in a map of classes. Default: by the names
         of the model's classes.
     names : tuple of str
         Names of the bands of an array.
-    fused_with : tuple of str
-        Further images of the same frame, fused with each query.
     threads : int
         Threads of a model; fixed, so that results are the same on every run.
-    mirror : "tell", "never" or "allow"
-        For a refused mask that would be located turned over: whether that is mentioned, not tried, or the answer.
+    mirror : bool or None
+        Whether what is given is mirrored. Default: as the georeference of its file says.
     units : "auto", "pixels" or "metres"
         Unit of roads that come as lines (see `sources.drawn_roads`).
     layer : str or None
         Layer of such roads, where their file has several.
-    aspect : float, "unknown" or None
-        How many times a pixel of a mask is as wide as high; None: once.
+    aspect : float or None
+        How many times a pixel is as wide as high. Default: as the georeference of its file says, or once.
     bands : (3,) tuple of int, or None
         The red, green and blue band of a photograph, counted from 1. Default: by their names, or the first three.
     """
@@ -53,14 +51,13 @@ class ReadOptions:
     threshold: float | None = None
     band: int | None = None
     segment: Literal["auto", "always", "never"] = "auto"
-    segmenters: tuple[str, ...] = ()
+    segmenter: str = ""
     class_name: str | None = None
-    fused_with: tuple[str, ...] = ()
     threads: int = 1
-    mirror: Literal["tell", "never", "allow"] = "tell"
+    mirror: bool | None = None
     units: Literal["auto", "pixels", "metres"] = "auto"
     layer: str | None = None
-    aspect: float | Literal["unknown"] | None = None
+    aspect: float | None = None
     bands: tuple[int, int, int] | None = None
     names: tuple[str, ...] = ()
 
@@ -75,12 +72,12 @@ class ReadOptions:
     @property
     def may_be_mask(self) -> bool:
         """Whether a query may be a mask; plugins are shown all that is given."""
-        return self.segment == "never" or (self.segment == "auto" and all(map(is_model, self.segmenters)))
+        return self.segment == "never" or (self.segment == "auto" and is_model(self.segmenter))
 
 
 def is_model(segmenter: str) -> bool:
-    """Whether a segmenter is the file of a model, not the name of a plugin."""
-    return segmenter.lower().endswith(".onnx")
+    """Whether a segmenter is a model, the file of one or "", the model that ships; not the name of a plugin."""
+    return not segmenter or segmenter.lower().endswith(".onnx")
 
 
 def _usual_search() -> LocateOptions:

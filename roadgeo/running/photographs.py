@@ -1,4 +1,4 @@
-"""A photograph, or several of one frame, shown to segmenters at some scales, in some ways, and located by their roads.
+"""A photograph, shown to a segmenter at some scales, in some ways, and located by its roads.
 
 Probability maps are kept. They are looked at with several thresholds and, where the size of a pixel is unknown, at
 several scales.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from roadgeo._progress import Say
-from roadgeo.errors import MaskError, PhotographError, PluginError
+from roadgeo.errors import MaskError, PluginError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Reason
@@ -33,11 +33,11 @@ from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.sources.segmentation.photograph import Photograph, open_photograph
-from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
+from roadgeo.sources.segmentation.probability import ProbabilityMap, mean_of
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
 
-__all__ = ["Frame", "Look", "call_segmenter", "load_model", "locate_photograph", "only_plugin", "open_frame"]
+__all__ = ["Frame", "Look", "call_segmenter", "load_model", "locate_photograph", "open_frame", "plugin_of"]
 
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
@@ -56,7 +56,7 @@ _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 @dataclass(frozen=True)
 class Look:
-    """One look at a photograph through segmenters.
+    """One look at a photograph through a model.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Look:
     finer : float
         How many times finer than that the photograph is shown.
     ways : int or None
-        Number of ways in which a model sees it; None: the number on each model's card.
+        Number of ways in which a model sees it; None: the number on its card.
     as_shown : bool
         In one way, where it was shown at that scale already, but not at the next finer one.
     lower : bool
@@ -83,7 +83,7 @@ class Look:
 
 
 class Frame:
-    """A photograph, or several of one frame, open to be shown to segmenters.
+    """A photograph, open to be shown to a model.
 
     Attributes
     ----------
@@ -97,65 +97,47 @@ class Frame:
         Number of scales worth trying.
     """
 
-    def __init__(
-        self,
-        paths: Sequence[str],
-        photographs: dict[str, Photograph],
-        masks: dict[str, RoadMask],
-        reading: ReadOptions,
-        gsd_m: tuple[float, float],
-        say: Say,
-    ) -> None:
+    def __init__(self, photograph: Photograph, reading: ReadOptions, gsd_m: tuple[float, float], say: Say) -> None:
         """Choose the grid and the scales; where no scale is known, the photograph is shown to the model for that."""
-        self.paths, self.photographs, self.masks, self.first = paths, photographs, masks, photographs[paths[0]]
-        self.reading, self.gsd_m, self.say = reading, gsd_m, say
-        self.names = reading.segmenters or ("",)
-        self.networks = {
-            name: load_model(name, reading.class_name, reading.threads) for name in self.names if not _is_plugin(name)
-        }
-        #: Probability of road by photograph, segmenter, scale and number of ways.
-        self._seen: dict[tuple[str, str, float, int], ProbabilityMap] = {}
-        k = max(1, math.ceil(math.sqrt(self.first.width * self.first.height / _MAX_GRID_PIXELS)))
-        self.own = round(self.first.height / k), round(self.first.width / k)
+        self.photograph, self.reading, self.gsd_m, self.say = photograph, reading, gsd_m, say
+        self.network = load_model(reading.segmenter, reading.class_name, reading.threads)
+        #: Probability of road by scale and number of ways.
+        self._seen: dict[tuple[float, int], ProbabilityMap] = {}
+        k = max(1, math.ceil(math.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS)))
+        self.own = round(photograph.height / k), round(photograph.width / k)
         self._scales, self.n_scales = self._known_scales()
         finer = _how_much_finer(self.own, self.scale(0))
         self.grid, self.coarser = (round(finer * self.own[0]), round(finer * self.own[1])), k / finer
 
     def _known_scales(self) -> tuple[list[float], int]:
         """Return the scales that are known, and how many there are with others: one where a pixel's size is known."""
-        if not self.networks:
-            return [1.0], 1
-        network, (low, high) = next(iter(self.networks.values())), self.gsd_m
+        low, high = self.gsd_m
         if high <= _KNOWN_SPAN * low:
-            return [scale_of(math.sqrt(low * high), network)], 1
-        stated = estimate_gsd(self.first.name)
-        known = [scale_of(stated, network)] if stated is not None and low <= stated <= high else []
-        return known, min(_MAX_SCALES, len(known) + len(try_scales(self.first, network, self.gsd_m)))
+            return [scale_of(math.sqrt(low * high), self.network)], 1
+        stated = estimate_gsd(self.photograph.name)
+        known = [scale_of(stated, self.network)] if stated is not None and low <= stated <= high else []
+        return known, min(_MAX_SCALES, len(known) + len(try_scales(self.photograph, self.network, self.gsd_m)))
 
     def scale(self, rank: int) -> float:
         """Return a scale worth trying; where it is not known, the photograph is shown to the model at many."""
         if rank >= len(self._scales):
-            self.say(f"looking for the scale of {self.first.name}")
-            name, network = next(iter(self.networks.items()))
-            found = rank_scales(self.first, network, self.gsd_m)
-            whole = {scale: seen for scale, seen in found.items() if seen is not None}
-            self._seen.update({(self.first.name, name, scale, 1): seen for scale, seen in whole.items()})
+            self.say(f"looking for the scale of {self.photograph.name}")
+            found = rank_scales(self.photograph, self.network, self.gsd_m)
+            self._seen.update({(scale, 1): seen for scale, seen in found.items() if seen is not None})
             self._scales += found
         return self._scales[rank]
 
     def looks(self) -> list[Look]:
         """Return the best scale's look, other scales, the photograph in more ways, and a lower threshold at the best.
 
-        A model is shown it in one way first where that was done already, but not at the next finer scale, and where
+        The model is shown it in one way first where that was done already, but not at the next finer scale, and where
         there is much to show. Beyond scales that were tried it is shown in more ways only if its card asks for fewer:
         of 60 photographs whose scale was unknown none was located so, and it was half of a refusal's time. Where one
         scale is known, the two scales that were shown together are looked at alone as well.
         """
         best = self.scale(0)
-        has_models = bool(self.networks) and not self.masks.keys() >= set(self.paths)
-        in_one = has_models and (self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS)
-        has_more = in_one and self.n_scales == 1
-        has_more |= has_models and min(network.card.ways for network in self.networks.values()) < _WAYS
+        in_one = self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS
+        has_more = (in_one and self.n_scales == 1) or self.network.card.ways < _WAYS
         looks = [Look(ways=1 if in_one else None)]
         most = _WAYS if has_more else looks[0].ways
         looks += [Look(rank, as_shown=True) for rank in range(1, self.n_scales)]
@@ -163,7 +145,7 @@ class Frame:
             looks.append(Look(ways=most, note=f", shown {most} ways"))
         if self.reading.threshold is None:
             looks.append(Look(ways=most, lower=True, note=", a lower threshold"))
-        if has_models and not has_more and self.n_scales == 1 and self._may_be_finer(best):
+        if not has_more and self.n_scales == 1 and self._may_be_finer(best):
             looks += [Look(finer=finer, ways=1, note=", shown alone") for finer in (1.0, _FINER)]
         return looks
 
@@ -181,42 +163,28 @@ class Frame:
         return Seen(f"scale {scale:.3g}{look.note}", seen.mask(spread_probability(threshold)[look.lower]), seen)
 
     def see(self, scale: float, ways: int | None) -> ProbabilityMap:
-        """Return the probability of road on the grid, of all photographs and segmenters together."""
-        maps = [self._see(path, name, scale, ways) for path in self.paths for name in self.names]
-        maps = [seen.resized(self.grid) for seen in maps]
-        return maps[0] if len(maps) == 1 else fuse(maps)
+        """Return the probability of road on the grid."""
+        return self._see(scale, ways or self.network.card.ways).resized(self.grid)
 
-    def _see(self, path: str, name: str, scale: float, ways: int | None) -> ProbabilityMap:
-        """Return what a segmenter sees in a photograph, not much finer than the grid."""
-        network = self.networks.get(name)
-        if network is None:
-            key = (path, name, 1.0, 1)
-            if key not in self._seen:
-                self._seen[key] = _of_mask(call_segmenter(name, path, self.reading.threshold), name)
-            return self._seen[key]
-        if path in self.masks:
-            return _of_mask(self.masks[path], "mask")
-        ways = ways or network.card.ways
+    def _see(self, scale: float, ways: int) -> ProbabilityMap:
+        """Return what the model sees, not much finer than the grid."""
         if ways > 1 and self._may_be_finer(scale):
-            parts = (_FINER * scale, ways // 2), (scale, ways - ways // 2)
-            seen_in = [self._see(path, name, *part) for part in parts]
-            rows = self.grid[0]
-            return fuse([seen.resized(self.grid) if seen.values.shape[0] > rows else seen for seen in seen_in])
-        key = (path, name, scale, ways)
+            parts = [self._see(_FINER * scale, ways // 2), self._see(scale, ways - ways // 2)]
+            return mean_of([seen.resized(self.grid) if seen.values.shape[0] > self.grid[0] else seen for seen in parts])
+        key = (scale, ways)
         if key not in self._seen or self._seen[key].values.shape[0] >= 2 * self.grid[0]:
-            photograph = self.photographs[path]
-            step = max(1, int(map_shape(photograph, scale)[0] / self.grid[0]))
-            self._seen[key] = segment(photograph, network, scale, self.say, step=step, ways=ways)
+            step = max(1, int(map_shape(self.photograph, scale)[0] / self.grid[0]))
+            self._seen[key] = segment(self.photograph, self.network, scale, self.say, step=step, ways=ways)
         return self._seen[key]
 
     def _was_shown_alone(self, scale: float) -> bool:
         """Whether a model was shown the photograph at a scale, and not at the next finer one that it would go with."""
-        shown = {scale for _, _, scale, _ in self._seen}
+        shown = {scale for scale, _ in self._seen}
         return scale in shown and not (self._may_be_finer(scale) and _FINER * scale in shown)
 
     def _shape_at(self, scale: float) -> tuple[float, float]:
         """Return (H, W) of the photograph at a scale."""
-        return self.first.height * scale, self.first.width * scale
+        return self.photograph.height * scale, self.photograph.width * scale
 
     def _may_be_finer(self, scale: float) -> bool:
         shown = _FINER * scale
@@ -224,8 +192,8 @@ class Frame:
 
 
 @contextmanager
-def open_frame(paths: Sequence[str], reading: ReadOptions, gsd_m: tuple[float, float], say: Say) -> Iterator[Frame]:
-    """Open a photograph, or several of one frame, some of which may be masks already.
+def open_frame(path: str, reading: ReadOptions, gsd_m: tuple[float, float], say: Say) -> Iterator[Frame]:
+    """Open a photograph.
 
     Parameters
     ----------
@@ -235,46 +203,36 @@ def open_frame(paths: Sequence[str], reading: ReadOptions, gsd_m: tuple[float, f
     Raises
     ------
     MaskError
-        One cannot be read.
+        It cannot be read.
     ModelError
         There is no model, or it cannot be run.
     """
-    masks = {}
-    if reading.segment == "auto" and reading.fused_with:
-        for path in paths:
-            with suppress(PhotographError):
-                masks[path] = read_mask(path, band=reading.band, threshold=reading.threshold)
-    with ExitStack() as stack:
-        photographs = {
-            path: stack.enter_context(open_photograph(path, reading.bands))
-            for path in dict.fromkeys(paths)
-            if path == paths[0] or path not in masks
-        }
-        yield Frame(paths, photographs, masks, reading, gsd_m, say)
+    with open_photograph(path, reading.bands) as photograph:
+        yield Frame(photograph, reading, gsd_m, say)
 
 
 def locate_photograph(
-    paths: Sequence[str],
+    path: str,
     references: Sequence[AnyReference],
     options: LocateOptions,
     reading: ReadOptions,
     how: Locate,
     say: Say,
 ) -> Sighting:
-    """Locate a photograph, or several of one frame, by the roads that segmenters see.
+    """Locate a photograph by the roads that a segmenter sees.
 
     Raises
     ------
     MaskError, ModelError
         As of `open_frame`.
     PluginError
-        A segmenter fails.
+        The segmenter fails.
     """
-    plugin = only_plugin(reading)
-    if plugin and len(paths) == 1:
-        seen = Seen("the segmenter's own threshold", call_segmenter(plugin, paths[0], reading.threshold))
+    plugin = plugin_of(reading)
+    if plugin:
+        seen = Seen("the segmenter's own threshold", call_segmenter(plugin, path, reading.threshold))
         return locate_looks([Look()], lambda _: seen, references, options, how)
-    with open_frame(paths, reading, options.match.camera.gsd_m, say) as frame:
+    with open_frame(path, reading, options.match.camera.gsd_m, say) as frame:
         on_grid, looks = _on_grid(options, frame.coarser), frame.looks()
         try:
             found = locate_looks(looks, frame.look, references, on_grid, how)
@@ -283,14 +241,14 @@ def locate_photograph(
             return _see_hardly_a_road(frame, ways, error, references)
     sighting = _in_own_pixels(found, frame.own)
     reason = sighting.location.reason.replace(searched_within(on_grid), searched_within(options))
-    return replace(sighting, location=replace(sighting.location, reason=reason, part_read=frame.first.page))
+    return replace(sighting, location=replace(sighting.location, reason=reason, part_read=frame.photograph.page))
 
 
 def _see_hardly_a_road(
     frame: Frame, ways: int | None, error: MaskError, references: Sequence[AnyReference]
 ) -> Sighting:
     """Return the refusal of a photograph in which no look shows roads that can be traced."""
-    name, (height, width) = frame.first.name, frame.own
+    name, (height, width) = frame.photograph.name, frame.own
     location = Location(
         name,
         "not_located",
@@ -342,14 +300,9 @@ def load_model(path: str = "", class_name: str | None = None, threads: int = 1) 
     return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
 
 
-def only_plugin(reading: ReadOptions) -> str:
-    """Return the name of the plugin that alone finds roads; nothing where there is a model too, or neither."""
-    return reading.segmenters[0] if len(reading.segmenters) == 1 and _is_plugin(reading.segmenters[0]) else ""
-
-
-def _is_plugin(segmenter: str) -> bool:
-    """Whether a segmenter is the name of a plugin: neither the file of a model, nor "", the model that ships."""
-    return bool(segmenter) and not is_model(segmenter)
+def plugin_of(reading: ReadOptions) -> str:
+    """Return the name of the plugin that finds roads; nothing where a model does."""
+    return "" if is_model(reading.segmenter) else reading.segmenter
 
 
 def call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
@@ -367,11 +320,3 @@ def call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
         kind = type(seen).__name__
         raise PluginError(f"the segmenter {name!r} returned a {kind}, expected a RoadMask or an array")
     return read_mask(seen, threshold=threshold, name=os.fspath(path))
-
-
-def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
-    """Return a mask as a map of probabilities 0.9 and 0.1, for it has none of its own."""
-    values = np.where(mask.roads, 229, 25).astype(np.uint8) if mask.probability is None else mask.probability.copy()
-    if mask.observed is not None:
-        values[~mask.observed] = NODATA
-    return ProbabilityMap(values, 0.5, mask.name, model)

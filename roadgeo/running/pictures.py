@@ -83,7 +83,7 @@ def pixels_of(picture: Any) -> dict[str, Any]:
     aspect, is_mirrored = stretch_of(wide, high), wide * high > 0.0 and (y[0], high) not in ((0.0, 1.0), (0.5, 1.0))
     if named_crs is not None:
         aspect, is_mirrored = Georeference(place, named_crs, (len(x), len(y)), "geotransform").pixel_shape()
-    return {**known, "aspect": aspect, "mirror": "allow" if is_mirrored else "tell"}
+    return {**known, "aspect": aspect, "mirror": bool(is_mirrored)}
 
 
 def _axis(data: Any, names: set[str]) -> Any:

@@ -18,9 +18,9 @@ from roadgeo.reference.reference import AnyReference
 from roadgeo.running.choosing import choose_place
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
-from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, only_plugin, open_frame
+from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, open_frame, plugin_of
 from roadgeo.running.pictures import as_file
-from roadgeo.running.variants import try_variants
+from roadgeo.running.variants import undoing
 from roadgeo.sources.drawn_roads import draw_roads
 from roadgeo.sources.georeference import read_pixel_shape
 from roadgeo.sources.masks import MaskSource, open_mask
@@ -70,30 +70,36 @@ def _look_for(
     say: Say,
 ) -> Sighting:
     if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
-        return _locate_lines(path, references, options, reading, how)
-    if not reading.fused_with:
-        with _open_as_mask(path, reading) as mask:
-            if mask is not None:
-                sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
-                sighting = try_variants(sighting, references, options, _as_stated(path, reading, sighting), how)
-                return replace(sighting, location=replace(sighting.location, part_read=mask.part))
+        return _locate_lines(path, references, options, reading, undoing(how, None, bool(reading.mirror)))
+    aspect, is_mirrored = read_pixel_shape(path) if isinstance(path, str) else (None, False)
+    mirror = is_mirrored if reading.mirror is None else reading.mirror
+    how = undoing(how, aspect if reading.aspect is None else reading.aspect, mirror)
+    sighting = _look_at(path, references, options, reading, how, say)
+    if mirror and reading.mirror is None:
+        reason = f"{sighting.location.reason}; the georeference of the file mirrors it, which was undone"
+        sighting = replace(sighting, location=replace(sighting.location, reason=reason))
+    return sighting
+
+
+def _look_at(
+    path: str | AnyArray,
+    references: Sequence[AnyReference],
+    options: LocateOptions,
+    reading: ReadOptions,
+    how: Locate,
+    say: Say,
+) -> Sighting:
+    """Locate a mask, or a photograph."""
+    with _open_as_mask(path, reading) as mask:
+        if mask is not None:
+            sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
+            return replace(sighting, location=replace(sighting.location, part_read=mask.part))
     with as_file(path) as file:
-        sighting = locate_photograph((file, *reading.fused_with), references, options, reading, how, say)
+        sighting = locate_photograph(file, references, options, reading, how, say)
         if not isinstance(path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
             sighting = replace(sighting, location=replace(sighting.location, query=_ARRAY, reason=reason))
-    if (stated := _as_stated(path, reading, sighting)) != reading:
-        sighting = try_variants(sighting, references, options, stated, how)
     return replace(sighting, of_photograph=True)
-
-
-def _as_stated(path: str | AnyArray, reading: ReadOptions, sighting: Sighting) -> ReadOptions:
-    """Return how an image that is not located is read, with the shape of its pixels that its file states by default."""
-    if not isinstance(path, str) or sighting.location.located or reading.mirror == "never":
-        return reading
-    aspect, is_mirrored = read_pixel_shape(path)
-    reading = replace(reading, aspect=aspect) if reading.aspect is None else reading
-    return replace(reading, mirror="allow") if is_mirrored else reading
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,7 @@ class FirstLook:
     coarser : float
         Pixels of the query for each of the mask, along a side: above 1 for a large photograph, below for a coarse one.
     probability : ProbabilityMap or None
-        What segmenters see in a photograph, in its own pixels, or in its mask's where it is large.
+        What a segmenter sees in a photograph, in its own pixels, or in its mask's where it is large.
     """
 
     mask: RoadMask
@@ -135,10 +141,10 @@ def look_once(
         if mask is not None:
             return FirstLook(mask.read(mask.thresholds[0]))
     with as_file(path) as file:
-        plugin = only_plugin(reading)
+        plugin = plugin_of(reading)
         if plugin:
             return FirstLook(call_segmenter(plugin, file, reading.threshold))
-        with open_frame([file], reading, gsd_m or CameraOptions().gsd_m, say) as frame:
+        with open_frame(file, reading, gsd_m or CameraOptions().gsd_m, say) as frame:
             seen = frame.see(frame.scale(0), None)
             try:
                 roads = frame.look(Look()).mask
@@ -198,5 +204,4 @@ def _locate_lines(
         camera = replace(camera, gsd_m=known, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
     options = replace(options, match=replace(options.match, camera=camera))
     sighting = locate_looks([drawing.mask], lambda mask: Seen("its lines", mask), references, options, how)
-    sighting = try_variants(sighting, references, options, replace(reading, aspect=None), how)
     return replace(sighting, location=replace(sighting.location, query_to_pixel=drawing.to_pixel))

@@ -1,8 +1,8 @@
-"""Variants of a query that no camera sees: mirrored, with pixels that are not square, or on another grid of pixels.
+"""Variants of a query: mirrored back, with square pixels, or on another grid of pixels.
 
-A scanner, or an array upside down, mirrors a mask; a facsimile, or a picture made to fit a page, samples the ground
-finer along one side, by an unknown factor. Variants of a refused mask are tried, and the place of a variant that is
-located is given in pixels of the mask.
+A scanner, or an array upside down, mirrors a mask; a raster in degrees, or a picture made to fit a page, samples the
+ground finer along one side. What is known of that, by hand or by the file, is undone before the search, and the place
+is given in pixels of the mask.
 """
 
 from __future__ import annotations
@@ -19,21 +19,16 @@ from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
-from roadgeo.location import Location, Reason
+from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
-from roadgeo.outputs.wording import format_lonlat
 from roadgeo.reference.reference import AnyReference
-from roadgeo.running.looks import Locate, Sighting, total_seconds
-from roadgeo.running.options import ReadOptions
+from roadgeo.running.looks import Locate
 
-__all__ = ["STRETCHES", "Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "try_variants"]
+__all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "undoing"]
 
-#: Limits of a try that is only mentioned: a mask that is merely turned over is mostly found in a tenth of it.
-_WORK_LIMIT_S = 1.0
-_WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
-#: Widths of a pixel, in heights, that are tried where it is not known; between two of them the search finds its way.
-STRETCHES = (0.83, 1.2, 0.7, 1.43, 0.58, 1.72, 0.5, 2.0)
+#: A camera's pixels are square to this share; what is stretched more has no camera that saw it.
+_SQUARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -51,12 +46,8 @@ class Variant:
     matrix: FloatArray
 
 
-def mirrored(mask: RoadMask) -> Variant:
-    """Return a mask turned over, left to right."""
-    return _turned_over(Variant(mask, np.eye(3)))
-
-
-def _turned_over(variant: Variant) -> Variant:
+def mirrored(variant: Variant) -> Variant:
+    """Return a variant mirrored, left to right."""
     over = np.array([[-1.0, 0.0, variant.mask.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     return Variant(variant.mask.mirrored(), over @ variant.matrix)
 
@@ -88,8 +79,8 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
     side = math.sqrt(abs(float(np.linalg.det(matrix))))  # pixels of the variant for each of the query, along a side
     back = Homography(PIXEL_TO_PLANE @ Homography(matrix).inverse().matrix @ PIXEL_TO_PLANE)
     camera, homography, seen, evidence = location.camera, location.homography, location.seen, location.evidence
-    order = _order_of_corners(location.size, size, matrix)
-    changed: dict[str, Any] = {"size": size}
+    order, turns = _order_of_corners(location.size, size, matrix), bool(np.linalg.det(matrix[:2, :2]) < 0.0)
+    changed: dict[str, Any] = {"size": size, "mirrored": location.mirrored != turns}
     changed["alternatives"] = tuple(
         replace(
             place,
@@ -103,7 +94,9 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
         changed.update(homography=homography / homography[2, 2], **_corners_of(location, order))
     if location.gsd_m is not None:
         changed["gsd_m"] = location.gsd_m * side
-    if camera is not None:
+    if turns or abs(np.divide(*np.hypot(*matrix[:2, :2])) - 1.0) > _SQUARE:
+        changed.update(camera=None, tilt_deg=None)
+    elif camera is not None:
         changed["camera"] = replace(
             camera, focal_px=camera.focal_px / side, focal_sigma_px=camera.focal_sigma_px / side
         )
@@ -137,73 +130,33 @@ def _moved(graph: Any, move: Homography) -> Any:
     return replace(graph, xy=move(graph.xy), coords=move(graph.coords))
 
 
-# --- trying them ------------------------------------------------------------------------------------------------------
+def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
+    """Return what locates a mask as `how` does, its pixels made square and itself mirrored back before the search.
 
-
-def try_variants(
-    sighting: Sighting, references: Sequence[AnyReference], options: LocateOptions, reading: ReadOptions, how: Locate
-) -> Sighting:
-    """Try the variants of a refused mask; the first that is located is the answer, where the user allows for it.
-
-    Stretched masks are tried where `reading.aspect` is given, and turned over where that is allowed. Else the mask is
-    turned over, and a refusal mentions
-    where it lies then: a mirrored image has no place, and only its owner knows how it came about. Where mirrored masks
-    are allowed the search is as thorough as any. Each try could agree by chance: together they pay for all of them.
+    Parameters
+    ----------
+    aspect : float or None
+        How many times a pixel is as wide as high; None: once.
+    mirror : bool
+        The mask is mirrored.
     """
-    refused, may_mirror = sighting.location, reading.mirror == "allow"
-    allowed = reading.aspect is not None or may_mirror
-    if reading.aspect is not None:
-        stretches = STRETCHES if reading.aspect == "unknown" else (reading.aspect,)
-        asked, n_variants = not refused.located, len(stretches) * (1 + may_mirror)
-        upright = (stretched(sighting.mask, stretch) for stretch in stretches)
-        variants = (v for variant in upright for v in (variant, _turned_over(variant))[: 1 + may_mirror])
-    else:
-        asked = reading.mirror != "never" and refused.status == "not_located" and options.method != "pair"
-        asked, n_variants = asked and refused.reason_code in _WORTH_A_TRY, 1
-        variants = (mirrored(mask) for mask in [sighting.mask])
-    if not asked:
-        return sighting
-    options = replace(options, min_log10_odds=options.min_log10_odds + math.log10(n_variants))
-    if not allowed:
-        options = _briefly(options)
-    spent = refused.seconds
-    for variant in variants:
+    if aspect in (None, 1.0) and not mirror:
+        return how
+
+    def locate(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
+        variant = Variant(mask, np.eye(3)) if aspect is None else stretched(mask, aspect)
+        variant = mirrored(variant) if mirror else variant
         answer = how(variant.mask, references, options)
         found = answer.location if isinstance(answer, Explanation) else answer
-        spent = total_seconds(spent, found.seconds)
-        if found.located:
-            location = _as_answer(found, variant, sighting.mask) if allowed else _mentioned(refused, found)
-            return replace(sighting, location=replace(location, seconds=spent))
-    return replace(sighting, location=replace(refused, seconds=spent))
+        found = _stating_pixels(in_pixels_of(found, mask.shape[::-1], variant.matrix), aspect)
+        return replace(answer, location=found) if isinstance(answer, Explanation) else found
+
+    return locate
 
 
-def _briefly(options: LocateOptions) -> LocateOptions:
-    """Return the options of a first sweep alone."""
-    search = replace(options.search, work_limit_s=min(_WORK_LIMIT_S, options.search.work_limit_s))
-    match = replace(options.match, without_roads=options.match.without_roads[:1])
-    return replace(options, effort="quick", search=search, match=match)
-
-
-def _as_answer(found: Location, variant: Variant, mask: RoadMask) -> Location:
-    """Return the place of a variant as it is of the mask; no camera saw the ground so."""
-    location = replace(in_pixels_of(found, mask.shape[::-1], variant.matrix), camera=None)
-    if np.linalg.det(variant.matrix) < 0.0:
-        reason = f"{found.reason}; the mask is mirrored, or the map is: it was turned over, left to right"
-        return replace(location, reason=reason, mirrored=True)
-    if location.homography is None:
+def _stating_pixels(location: Location, aspect: float | None) -> Location:
+    """Return a location whose reason states the shape of the pixels on the ground, where they are not square."""
+    if location.homography is None or location.size is None or aspect in (None, 1.0):
         return location
-    wide, high = np.hypot(*Homography(location.homography).jacobian(Frame(*mask.shape[::-1]).center))
-    reason = f"{found.reason}; its pixels are {wide / high:.2f} times as wide as high"
-    return replace(location, reason=reason, tilt_deg=None)
-
-
-def _mentioned(refused: Location, found: Location) -> Location:
-    """Return a refusal that mentions where the mask lies turned over."""
-    if found.center is None:
-        return refused
-    where = format_lonlat(found.center.lon, found.center.lat)
-    reason = (
-        f"the mask is mirrored: turned over, left to right, it lies at {where} on {found.reference}; "
-        "flip the image and locate it again. Or the map is mirrored, its x and y exchanged"
-    )
-    return replace(refused, reason=reason, reason_code=Reason.MIRRORED)
+    wide, high = np.hypot(*Homography(location.homography).jacobian(Frame(*location.size).center))
+    return replace(location, reason=f"{location.reason}; its pixels are {wide / high:.2f} times as wide as high")

@@ -162,7 +162,7 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     options = LocateOptions()
     match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
     search = replace(options.search, time_limit_s=60.0)
-    reading = replace(image.settings.reading, mirror="never")  # a variant would search the whole map
+    reading = replace(image.settings.reading, mirror=False, aspect=1.0)  # its georeference is what is checked
     locate_query(image.name, [reference], replace(options, match=match, search=search), reading, how=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")

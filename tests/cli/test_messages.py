@@ -89,26 +89,18 @@ def test_several_thresholds_are_tried_before_a_refusal(porto: Path, capfd: pytes
     assert "; its roads were traced in " in capfd.readouterr().out
 
 
-def test_a_mirrored_mask_is_refused_with_the_reason(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite("mirrored.png", drone()[:, ::-1])
-    assert locate("mirrored.png", porto, "--json", "-q") == 3
-    refused = json.loads(capfd.readouterr().out)
-    assert refused["reason_code"] == "mirrored"
-    assert refused["homography"] is None
-    assert "turned over, left to right, it lies at 41.15" in refused["reason"]
-    assert sorted(path.name for path in Path().iterdir()) == ["mirrored.png", "mirrored_location.json"]
-
-
-def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mirrored_mask_is_located_by_hand(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """What is drawn of it is what is drawn of the mask the right way round."""
     cv2.imwrite("mirrored.png", drone()[:, ::-1])
     more = ["--plot", "--report", "--also", "gcps"]
-    assert locate("mirrored.png", porto, "--allow-mirror", "--json", "-q", *more) == 0
+    assert locate("mirrored.png", porto, "--json", "-q") == 3
+    assert "mirror" not in json.loads(capfd.readouterr().out)["reason"]
+    assert locate("mirrored.png", porto, "--mirror", "--json", "-q", *more) == 0
     found = json.loads(capfd.readouterr().out)
-    assert locate(str(DRONE), porto, "--allow-mirror", "--json", "-q") == 0
+    assert locate(str(DRONE), porto, "--json", "-q") == 0
     straight = json.loads(capfd.readouterr().out)
     assert (found["mirrored"], straight["mirrored"]) == (True, False)
-    assert "the mask is mirrored" in found["reason"]
+    assert "mirror" not in found["reason"]
     assert found["camera"] is None
     assert np.linalg.det(found["homography"]) * np.linalg.det(straight["homography"]) < 0
     corners, others = np.array(found["footprint"]), np.array(straight["footprint"])[[1, 0, 3, 2]]
@@ -118,6 +110,26 @@ def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: Path, capfd: py
         assert np.allclose(ours.bounds, his.bounds, atol=2)
         same = ours.read(1)[5:-5, 5:-5] == his.read(1)[5 : ours.height - 5, 5 : ours.width - 5]
         assert same.mean() > 0.98
+
+
+@pytest.mark.parametrize(("wide", "high"), [(1.0, 1.0), (1.0, -1.6)])
+def test_the_shape_of_pixels_is_as_the_file_states_it(
+    porto: Path, capfd: pytest.CaptureFixture[str], wide: float, high: float
+) -> None:
+    """A mask whose rows run northwards, and one that is stretched, both at another place than they state."""
+    mask = drone()[::-1] if high > 0 else drone()
+    mask = cv2.resize(mask, (mask.shape[1], round(mask.shape[0] / abs(high))), interpolation=cv2.INTER_AREA)
+    place = {"crs": "EPSG:32629", "transform": rasterio.Affine(wide, 0, 5e5, 0, high, 4.5e6)}
+    profile = {"driver": "GTiff", "width": mask.shape[1], "height": mask.shape[0], "count": 1, "dtype": "uint8"}
+    with rasterio.open("stated.tif", "w", **profile, **place) as dataset:
+        dataset.write(mask, 1)
+    assert locate("stated.tif", porto, "--json", "-q") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["mirrored"] is (high > 0)
+    assert ("the file mirrors it" in found["reason"]) is (high > 0)
+    assert ("times as wide as high" in found["reason"]) is (high < 0)
+    assert (found["center"]["lon"], found["center"]["lat"]) == pytest.approx((-8.61, 41.15), abs=0.05)
+    assert locate("stated.tif", porto, "--no-mirror", "-q") == (3 if high > 0 else 0)
 
 
 def test_the_place_that_a_mask_states_is_compared(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from support.documents import commands
 
 import roadgeo
 from roadgeo.cli import COMMANDS, cli, main
-from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Read
+from roadgeo.cli.options import BOX, GSD, NEAR, RANGE, Read
 from roadgeo.matching.hints import HINTS, apply_hints
 from roadgeo.matching.options import LocateOptions
 from roadgeo.serving.requests import read_query_string
@@ -29,8 +29,8 @@ TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2), (FOCAL, 1), (ASPECT, 1)],
-    ids=["box", "near", "range", "gsd", "focal", "aspect"],
+    [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2), (FOCAL, 1)],
+    ids=["box", "near", "range", "gsd", "focal"],
 )
 @given(text=TEXTS)
 def test_any_text_is_finite_numbers_a_word_or_refused(kind: Read, count: int, text: str) -> None:
@@ -38,7 +38,7 @@ def test_any_text_is_finite_numbers_a_word_or_refused(kind: Read, count: int, te
         found = kind.convert(text, None, None)
     except click.BadParameter:
         return
-    if found not in ("exif", "unknown"):
+    if found != "exif":
         numbers = found if count > 1 else (found,)
         assert len(numbers) == count
         assert all(map(math.isfinite, numbers))
@@ -55,19 +55,15 @@ def test_any_text_is_finite_numbers_a_word_or_refused(kind: Read, count: int, te
         (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
         (FOCAL, "EXIF", "exif"),
         (FOCAL, "1200", 1200.0),
-        (ASPECT, "unknown", "unknown"),
-        (ASPECT, "0.25", 0.25),
-        (ASPECT, "4", 4.0),
         *((RANGE, text, "expected") for text in ("2:1", "0:1", "a:b", "1:nan")),
         *((NEAR, text, "expected") for text in ("42.3,-171.1,10", "1,1,0", "1,1")),
         *((BOX, text, "expected") for text in ("1,2,3,2", "1,2,1,4", "1,2,190,4")),
-        *((ASPECT, text, "expected") for text in ("0.2", "4.1", "nan", "wide", "")),
         (NEAR, "42.36,-171.06,5000", "longitude comes first: did you mean -171.06,42.36,5000"),
         (BOX, "42.23,-171.19,42.44,-170.95", "longitude comes first: did you mean -171.19,42.23,-170.95,42.44"),
     ],
 )
 def test_numbers_are_read_or_what_was_expected_is_said(kind: Read, text: str, read: object) -> None:
-    if isinstance(read, str) and read not in ("exif", "unknown"):
+    if isinstance(read, str) and read != "exif":
         with pytest.raises(click.BadParameter, match=read):
             kind.convert(text, None, None)
     else:

@@ -34,11 +34,11 @@ def read_in(module: str) -> set[str]:
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     taken = loaded | texts
     if "read_options" in loaded:
-        taken |= {field.name for field in fields(ReadOptions)} | {"allow_mirror"}
+        taken |= {field.name for field in fields(ReadOptions)}
     if "make_cluster" in loaded:
         taken |= {"engine", "scheduler", "divide_map"}
     if "find_tasks" in loaded:
-        taken |= {"fuse", "page", "recursive"}
+        taken |= {"page", "recursive"}
     if "REGISTRY" in loaded:
         taken |= {output.option.removeprefix("--") for output in REGISTRY.values()}
     if "hinted" in loaded:
@@ -69,25 +69,25 @@ def given(command: click.Command, *more: str) -> dict[str, object]:
     return dict(command.make_context("name", ["image.tif", *READING, *more]).params)
 
 
-def check(reading: ReadOptions, segmenters: tuple[str, ...]) -> None:
+def check(reading: ReadOptions, segmenter: str) -> None:
     for field, value in READING.values():
         assert getattr(reading, field) == value, field
-    assert reading.segmenters == segmenters
+    assert reading.segmenter == segmenter
 
 
 def test_how_images_are_read_reaches_each_command(tmp_path: Path) -> None:
     model = str(tmp_path / "model.onnx")
     Path(model).touch()
     for command in (locate_command, vectorize_command):
-        check(read_options(given(command, f"--segmenter={model}")), (model,))
-    check(_settings(given(verify_command, f"--segmenter={model}"), [], 1).reading, (model,))
+        check(read_options(given(command, f"--segmenter={model}")), model)
+    check(_settings(given(verify_command, f"--segmenter={model}"), 1).reading, model)
     frames = _frame_options(
         given(
             track_command,
             *(f"--segmenter={model}", "--recursive", "--gsd=0.3", "--motion-sigma=3", "--every=2", "--interval=4"),
         )
     )
-    check(frames.reading, (model,))
+    check(frames.reading, model)
     assert frames.gsd_m is not None
     assert (frames.motion_px, frames.every_s, frames.interval_s, frames.recursive) == (3.0, 2.0, 4.0, True)
     usual = FrameOptions()
@@ -98,7 +98,7 @@ def test_how_images_are_read_reaches_each_command(tmp_path: Path) -> None:
 
 
 def test_what_locate_alone_reads() -> None:
-    reported = given(locate_command, "--allow-mirror", "--aspect=1.5", "--units=metres", "--layer=roads")
-    reading = read_options(reported, ["other.tif"], jobs=2)
-    assert (reading.mirror, reading.aspect, reading.units, reading.layer) == ("allow", 1.5, "metres", "roads")
-    assert (reading.fused_with, reading.threads) == (("other.tif",), 1)
+    reported = given(locate_command, "--mirror", "--aspect=1.5", "--units=metres", "--layer=roads")
+    reading = read_options(reported, jobs=2)
+    assert (reading.mirror, reading.aspect, reading.units, reading.layer) == (True, 1.5, "metres", "roads")
+    assert reading.threads == 1

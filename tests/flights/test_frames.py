@@ -26,7 +26,7 @@ def shift(dx: float, dy: float) -> np.ndarray:
 def model(tmp_path: Path) -> FrameOptions:
     """Frames of half a metre, and a network that takes what is light for road."""
     path = brightness_model(tmp_path / "light.onnx", props={"resolution": 50})
-    return FrameOptions(ReadOptions(segmenters=(str(path),)), gsd_m=(0.4, 0.625))
+    return FrameOptions(ReadOptions(segmenter=str(path)), gsd_m=(0.4, 0.625))
 
 
 @pytest.fixture

@@ -118,19 +118,19 @@ def axes(steps: tuple[float, float], **coords: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("coords", "aspect", "mirror"),
     [
-        (axes((1.0, -1.0)), None, "tell"),
-        (axes((1.0, 1.0)), None, "allow"),
-        (axes((1.5, -1.0)), 1.5, "tell"),
-        ({"y": np.arange(40), "x": np.arange(50)}, None, "tell"),  # numbers of pixels
-        ({"lat": 60 + 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, "allow"),
-        ({"lat": 60 - 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, "tell"),
+        (axes((1.0, -1.0)), None, False),
+        (axes((1.0, 1.0)), None, True),
+        (axes((1.5, -1.0)), 1.5, False),
+        ({"y": np.arange(40), "x": np.arange(50)}, None, False),  # numbers of pixels
+        ({"lat": 60 + 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, True),
+        ({"lat": 60 - 1e-5 * np.arange(40), "lon": 9 + 1e-5 * np.arange(50)}, 0.5, False),
     ],
 )
 def test_the_shape_of_pixels_is_as_the_axes_state_it(
-    coords: dict[str, object], aspect: float | None, mirror: str
+    coords: dict[str, object], aspect: float | None, mirror: bool
 ) -> None:
     known = pixels_of(xarray.DataArray(np.zeros((40, 50)), dims=tuple(coords), coords=coords))
-    assert known["mirror"] == mirror
+    assert known["mirror"] is mirror
     assert known["aspect"] == (None if aspect is None else pytest.approx(aspect, rel=0.01))
 
 

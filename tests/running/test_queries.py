@@ -83,9 +83,9 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, int]]:
     return taken
 
 
-@pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
+@pytest.mark.parametrize(("segmenter", "ways"), [("", True), ("model", True), ("plugin", False)])
 def test_the_second_look_shows_the_photograph_more_ways(
-    segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, shown: object, monkeypatch: pytest.MonkeyPatch
+    segmenter: str, ways: bool, model: str, photo: Path, shown: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[str] = []
 
@@ -94,10 +94,9 @@ def test_the_second_look_shows_the_photograph_more_ways(
         raise MaskError("that is all")
 
     monkeypatch.setattr(photographs, "locate_looks", note)
-    names = tuple(model if name == "model" else name for name in segmenters)
     mask = RoadMask(np.zeros((10, 10), np.bool_))
     monkeypatch.setattr(photographs, "call_segmenter", lambda *_: mask)
-    query = ReadOptions(segment="always", segmenters=names)
+    query = ReadOptions(segment="always", segmenter=model if segmenter == "model" else segmenter)
     options = LocateOptions()
     camera = replace(options.match.camera, gsd_m=(0.45, 0.55))
     options = replace(options, match=replace(options.match, camera=camera))
@@ -107,7 +106,7 @@ def test_the_second_look_shows_the_photograph_more_ways(
         with pytest.raises(MaskError):
             locate_query(str(photo), [], options, query)
     photographs.load_model.cache_clear()  # another test looks what is said without a model
-    if ways and not names:  # the model that ships is shown all ways at once; then each of these alone
+    if ways and not segmenter:  # the model that ships is shown all ways at once; then each of these alone
         assert taken == ["", ", a lower threshold", ", shown alone", ", shown alone"]
         return
     assert (len(taken) > 1 and taken[1].endswith("shown 2 ways")) == ways
@@ -120,7 +119,7 @@ def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
 ) -> None:
     props = {"class_names": {0: "ground", 1: "road"}, "ways": ways}
     model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
-    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenters=(str(model),)))
+    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenter=str(model)))
     assert shown == expected
 
 
@@ -140,7 +139,7 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
 
     monkeypatch.setattr(photographs, "locate_looks", take)
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: NOTHING, 1.0: None, 2.0: None})
-    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenters=(str(model),)))
+    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenter=str(model)))
     assert taken == ["0", "1", "2", "0, a lower threshold"]
     # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
     assert shown == [(1.0, 2), (2.0, 2)]
@@ -152,8 +151,8 @@ def test_a_scale_that_was_tried_alone_is_not_shown_finer(
     """What was seen at the finest scale that is worth a look goes with the coarser one; a finer one would be dear."""
     model = brightness_model(tmp_path / "light.onnx", size=256, props={"ways": 2})
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: dict.fromkeys((0.5, 0.25, 0.125), NOTHING))
-    reading = ReadOptions(segment="always", segmenters=(str(model),))
-    with photographs.open_frame([str(photo)], reading, (0.0, np.inf), lambda *_: None) as frame:
+    reading = ReadOptions(segment="always", segmenter=str(model))
+    with photographs.open_frame(str(photo), reading, (0.0, np.inf), lambda *_: None) as frame:
         for look in frame.looks():
             with suppress(MaskError):
                 frame.look(look)
@@ -241,7 +240,7 @@ def test_no_scale_is_looked_for_in_vain(
     monkeypatch.setattr(
         photographs, "segment", lambda *given, **reported: calls.append("shown") or segment(*given, **reported)
     )
-    query = ReadOptions(segmenters=(model,))
+    query = ReadOptions(segmenter=model)
     sighting = locate_query(str(photo), [open_reference(porto)], reading=query)
     assert sighting.location.located
     assert calls == ["ranked" if stated is None else "shown"]
@@ -280,7 +279,7 @@ def test_what_is_seen_is_shown_without_a_map(
 
 
 def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> None:
-    reading = ReadOptions(threshold=0.4, segmenters=(model,))
+    reading = ReadOptions(threshold=0.4, segmenter=model)
     assert queries.look_once(str(photo), (0.6, 1.0), reading).probability is not None
     assert queries.look_once(str(DRONE), None, reading).probability is None
     as_mask = replace(reading, threshold=200.0, segment="never")
@@ -291,7 +290,7 @@ def test_what_plugins_and_masks_show(
     tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(photographs, "call_plugin", lambda *_: cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE))
-    seen = queries.look_once(str(photo), None, ReadOptions(segmenters=("plugin",)))
+    seen = queries.look_once(str(photo), None, ReadOptions(segmenter="plugin"))
     assert seen.probability is None
     assert seen.coarser == 1.0
     np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(DRONE), None, ReadOptions()).mask.roads)
@@ -328,39 +327,6 @@ def test_a_mask_of_the_users_is_not_overwritten(
     assert "not written by roadgeo" in capsys.readouterr().err
     assert mine.read_bytes() == content
     assert [path.name for path in tmp_path.iterdir()] == ["flight_mask.tif"]
-
-
-def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[str] = []
-
-    def note(looks, see, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.note for look in looks)
-        see(looks[0])
-        raise StopIteration
-
-    monkeypatch.setattr(photographs, "locate_looks", note)
-    monkeypatch.setattr(photographs, "segment", lambda *_: pytest.fail("a mask was shown to a model"))
-    with pytest.raises(StopIteration):
-        locate_query(str(DRONE), [], reading=ReadOptions(fused_with=(str(DRONE),)))
-    assert taken
-    assert not any("ways" in item for item in taken)
-
-
-def test_two_exposures_are_fused(
-    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Each shows one half of the roads."""
-    image = cv2.imread(str(photo))
-    half = image.shape[1] // 2
-    for name, part in (("a.jpg", slice(0, half)), ("b.jpg", slice(half, None))):
-        shaded = image.copy()
-        shaded[:, part] = np.minimum(shaded[:, part], 120)
-        cv2.imwrite(str(tmp_path / name), shaded)
-    pair = [str(tmp_path / "a.jpg"), str(tmp_path / "b.jpg")]
-    out = str(tmp_path / "out")
-    document = run(capsys, *pair, "--fuse", "-r", str(porto), "--segmenter", model, "-o", out)
-    assert document["status"] == "located"
-    assert offset(document) < 3.0
 
 
 def test_a_photograph_that_shows_no_road_is_not_located(

@@ -62,7 +62,7 @@ def test_told_is_no_worse_than_blind(data_dir: Path, rows: list[dict[str, str]],
     found: dict[str, dict[str, float]] = {"nothing": {}, "scale": {}, "scale and heading": {}}
     for what in found:
         for row in rows:
-            path, query = str(data_dir / "photographs" / row["file"]), ReadOptions(mirror="never")
+            path, query = str(data_dir / "photographs" / row["file"]), ReadOptions()
             location = locate_query(path, [maps[row["roads"]]], told(row, what), query).location
             if location.located:
                 assert is_right(location, row), (what, row["file"])

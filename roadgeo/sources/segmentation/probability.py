@@ -17,12 +17,12 @@ from roadgeo.sources.bands import PROBABILITY_TAG, THRESHOLD_TAG
 from roadgeo.storage.files import replacing
 from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright
 
-__all__ = ["NODATA", "ProbabilityMap", "fuse"]
+__all__ = ["NODATA", "ProbabilityMap", "mean_of"]
 
 #: 0 to 254 stand for probabilities 0 to 1; this for ground that was not observed.
 NODATA = PROBABILITY_UNKNOWN
 
-_STRIP_PIXELS = 1 << 22  # fused at a time
+_STRIP_PIXELS = 1 << 22  # averaged at a time
 
 
 @dataclass(frozen=True)
@@ -118,50 +118,29 @@ class ProbabilityMap:
                 dataset.write(self.values, 1)
 
 
-def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
-    """Fuse looks at one scene: the mean of the log odds of those that saw a pixel; the frame is the first one's.
+def mean_of(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
+    """Return the mean of the log odds of what a model saw in several ways, (H, W) of the first.
 
-    Models of one threshold mean the same by a probability, which is kept; of others only the thresholds mean the same.
-
-    Raises
-    ------
-    MaskError
-        They show frames of different proportions.
+    At each pixel those count that observed it.
     """
     first = maps[0]
-    alike = all(item.threshold == first.threshold for item in maps)
     height, width = first.values.shape
-    for entry in maps:
-        rows, columns = entry.values.shape
-        if abs(rows * width - columns * height) > 0.01 * rows * width:
-            raise MaskError(
-                f"{entry.name}: {columns} x {rows} pixels, but {first.name} {width} x {height}; "
-                "expected looks at the same frame: cut them alike, or locate them one by one"
-            )
     values = [item.resized((height, width)).values for item in maps]
-    thresholds = [0.5 if alike else item.threshold for item in maps]
-    fused = np.empty((height, width), np.uint8)
+    mean = np.empty((height, width), np.uint8)
     step = max(1, _STRIP_PIXELS // width)
     for top in range(0, height, step):
-        fused[top : top + step] = _mean([value[top : top + step] for value in values], thresholds)
-    models = dict.fromkeys(item.model for item in maps)
-    return ProbabilityMap(fused, first.threshold if alike else 0.5, first.name, " + ".join(models), first.pixel)
+        mean[top : top + step] = _mean([value[top : top + step] for value in values])
+    return replace(first, values=mean)
 
 
-def _mean(values: Sequence[AnyArray], thresholds: Sequence[float]) -> AnyArray:
+def _mean(values: Sequence[AnyArray]) -> AnyArray:
     """Return the mean of the log odds of those (H, W) that observed a pixel, as a probability."""
+    share = (np.arange(256, dtype=np.float32).clip(0, PROBABILITY_SURE) + 0.5) / 255
+    log_odds: AnyArray = np.log(share / (1 - share)).astype(np.float32)
     total, count = np.zeros(values[0].shape, np.float32), np.zeros(values[0].shape, np.float32)
-    for value, threshold in zip(values, thresholds, strict=True):
+    for value in values:
         seen = value != NODATA
-        total += np.where(seen, _log_odds(value, threshold), 0)
+        total += np.where(seen, log_odds[value], 0)
         count += seen
-    share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
-    return np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
-
-
-def _log_odds(values: AnyArray, threshold: float) -> AnyArray:
-    """Return the log odds of each value, 0 at the threshold, for models differ in how sure they are."""
-    table = (np.arange(256, dtype=np.float32).clip(0, 254) + 0.5) / 255
-    odds = np.log(table / (1 - table)) - np.log(threshold / (1 - threshold))
-    found: AnyArray = odds.astype(np.float32)[values]
-    return found
+    mean = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
+    return np.where(count > 0, np.rint(PROBABILITY_SURE * mean), NODATA).astype(np.uint8)

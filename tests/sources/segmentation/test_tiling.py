@@ -17,7 +17,7 @@ from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
-from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
+from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, mean_of
 from roadgeo.sources.segmentation.tiling import _look, segment
 
 MODELS = Path(__file__).parents[2] / "data" / "models"
@@ -224,34 +224,26 @@ def test_another_grid_keeps_what_was_not_observed() -> None:
         assert (other[:, shape[1] // 2 + 2 :] == 200).all()
 
 
-def test_two_looks_are_fused() -> None:
+def test_the_mean_of_two_ways_counts_where_one_observed_nothing() -> None:
     a, b = np.full((50, 60), 127, np.uint8), np.full((100, 120), 127, np.uint8)
     a[:10], b[:20] = 220, 200
     a[20:30], b[40:60] = 240, 10
     a[40:], b[80:] = NODATA, 220
-    fused = fuse([ProbabilityMap(a, name="a"), ProbabilityMap(b, name="b")]).values
-    assert 200 <= fused[5, 5] <= 220
-    assert 100 < fused[25, 25] < 160
-    assert fused[45, 5] == pytest.approx(220, abs=1)
-    both = fuse([ProbabilityMap(np.full((9, 9), NODATA, np.uint8))] * 2).values
+    mean = mean_of([ProbabilityMap(a, name="a"), ProbabilityMap(b, name="b")]).values
+    assert 200 <= mean[5, 5] <= 220
+    assert 100 < mean[25, 25] < 160
+    assert mean[45, 5] == pytest.approx(220, abs=1)
+    both = mean_of([ProbabilityMap(np.full((9, 9), NODATA, np.uint8))] * 2).values
     assert (both == NODATA).all()
-    with pytest.raises(MaskError, match="same frame"):
-        fuse([ProbabilityMap(a, name="a"), ProbabilityMap(np.zeros((50, 90), np.uint8), name="c")])
 
 
-def test_a_model_of_another_threshold_counts_from_there() -> None:
-    sure, shy = np.full((9, 9), 127, np.uint8), np.full((9, 9), 51, np.uint8)
-    fused = fuse([ProbabilityMap(sure, 0.5), ProbabilityMap(shy, 0.2)]).values
-    np.testing.assert_allclose(fused, 127, atol=2)
-
-
-def test_maps_are_fused_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_mean_is_taken_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a large photograph the numbers with a point would take gigabytes."""
     values = np.random.default_rng(1).integers(0, 256, (2, 70, 40)).astype(np.uint8)
     whole, maps = [], [ProbabilityMap(value, 0.3) for value in values]
     for pixels in (1 << 20, 1000):
         monkeypatch.setattr(probability, "_STRIP_PIXELS", pixels)
-        whole.append(fuse(maps))
+        whole.append(mean_of(maps))
     np.testing.assert_array_equal(whole[0].values, whole[1].values)
     assert whole[0].threshold == 0.3
 
