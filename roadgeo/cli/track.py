@@ -112,7 +112,11 @@ _OPTIONS = (
     row("--every", "SECONDS", FLIGHT,
         "Take a frame of a video every so often. Default: 1.", type=click.FloatRange(min=0), default=1.0),
     row("--interval", "SECONDS", FLIGHT,
-        "Time between images. Default: 1.", type=click.FloatRange(min=0), default=1.0, rare=True),
+        "Time between images. Default: as EXIF states it, where all have times, else 1.",
+        type=click.FloatRange(min=0, min_open=True), rare=True),
+    row("--aspect", "RATIO", FLIGHT,
+        "How many times a pixel is as wide as high. Default: as the file states it, else 1.",
+        type=click.FloatRange(0.25, 4), rare=True),
     row("--start", "TIME", FLIGHT, "When the first frame was taken.", type=TIME),
     take("segment", "class_name", "mask_values"),
     take("segmenter", metavar="MODEL.onnx", type=click.Path(), help="Who finds the roads."),
@@ -204,6 +208,7 @@ def _frame_options(given: dict[str, Any]) -> FrameOptions:
         motion_px=given["motion_sigma"],
         every_s=given["every"],
         interval_s=given["interval"],
+        aspect=given["aspect"],
         recursive=given["recursive"],
     )
 

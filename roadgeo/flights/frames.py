@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -18,24 +19,31 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._text import visible
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.flights.motion import Odometer, between_images
 from roadgeo.flights.strips import place_strips
 from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions, follow
+from roadgeo.geometry.georeference import stretch_of
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import load_model
-from roadgeo.running.tasks import SUFFIXES, find_masks, in_natural_order
+from roadgeo.running.tasks import SUFFIXES, VIDEOS, find_masks, in_natural_order
+from roadgeo.running.variants import resampled
+from roadgeo.sources.exif import read_time
+from roadgeo.sources.georeference import read_pixel_shape
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.files import writing
+from roadgeo.storage.rasters import is_raster
 
-__all__ = ["VIDEOS", "FrameOptions", "follow_frames", "read_frames", "read_stills"]
+__all__ = ["FrameOptions", "follow_frames", "read_frames", "read_stills"]
 
 _LOG = logging.getLogger(__name__)
 
-#: Suffixes of videos.
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv")
+#: Frames a second of a video that states none, or none that makes sense.
+_USUAL_RATE = 25.0
+_HEAD_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -54,8 +62,10 @@ class FrameOptions:
         Standard deviation of a corner moved by the motion. None: the usual one of its source.
     every_s : float
         Time between the frames taken of a video; 0: all.
-    interval_s : float
-        Time between images without timestamps.
+    interval_s : float or None
+        Time between images. None: as EXIF states it, where all of them have times, else a second.
+    aspect : float or None
+        How many times a pixel is as wide as high. None: as each file states it, else square.
     recursive : bool
         Whether folders stand for the images in all folders within them, too.
     """
@@ -65,17 +75,24 @@ class FrameOptions:
     motion: Mapping[str, FloatArray] | None = None
     motion_px: float | None = None
     every_s: float = 1.0
-    interval_s: float = 1.0
+    interval_s: float | None = None
+    aspect: float | None = None
     recursive: bool = False
 
 
 class _Image(NamedTuple):
-    """A frame's file, its name, and its time."""
+    """A frame's file, its name, its time, and how many times its pixels are as wide as high."""
 
     path: str
     name: str
     time_s: float
+    aspect: float
     stays: bool = True
+
+    @property
+    def stretch(self) -> tuple[float, float]:
+        """Columns and rows of the frame, whose pixels are square, for each of the file."""
+        return max(self.aspect, 1.0), max(1.0 / self.aspect, 1.0)
 
 
 @dataclass
@@ -103,9 +120,10 @@ def read_frames(arguments: Sequence[str], options: FrameOptions | None = None) -
     with ExitStack() as stack:
         for number, image in enumerate(_images(arguments, options, stack)):
             mask, grey = _read(image, options, last)
-            motion, error_px = _motion(image.name, mask, grey, options, last) if number else (None, 1.5)
+            motion, error_px = _motion(image, mask, grey, options, last) if number else (None, 1.5)
             last.mask, last.grey = mask, grey
-            yield FlightFrame(number, image.name, image.time_s, mask, motion, options.motion_px or error_px)
+            error_px = options.motion_px or error_px
+            yield FlightFrame(number, image.name, image.time_s, mask, motion, error_px, image.stretch)
 
 
 def read_stills(
@@ -125,7 +143,7 @@ def read_stills(
     with ExitStack() as stack:
         for number, image in enumerate(_images(arguments, options, stack)):
             mask, grey = _read(image, options, last)
-            read.append((image, FlightFrame(number, image.name, image.time_s, mask), grey))
+            read.append((image, FlightFrame(number, image.name, image.time_s, mask, stretch=image.stretch), grey))
         for image, frame, grey in read:
             if last.has_photographs and grey is None and image.stays and frame.mask.roads.any():
                 mask, grey = _read(image, options, last)
@@ -157,13 +175,47 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
     """Yield frames with their times: each file begins where the one before ended."""
     if len(arguments) > 1 and list(arguments) == sorted(arguments) != sorted(arguments, key=in_natural_order):
         _LOG.warning("frames come in the order of their names as text, frame_10 before frame_2; give their folder")
+    paths = find_masks(arguments, options.recursive, SUFFIXES + VIDEOS)
+    are_videos = [_is_video(path) for path in paths]
+    paths, times = (paths, []) if any(are_videos) else _by_time(paths, options)
     begun_s = 0.0
-    for path in find_masks(arguments, options.recursive, SUFFIXES + VIDEOS):
-        if Path(path).suffix.lower() in VIDEOS and Path(path).is_file():
+    for n, path in enumerate(paths):
+        if are_videos[n]:
             begun_s = yield from _video(path, options, stack, begun_s)
         else:
-            yield _Image(path, Path(path).name, begun_s)
-            begun_s += options.interval_s
+            aspect = options.aspect or read_pixel_shape(path)[0] or 1.0
+            yield _Image(path, Path(path).name, times[n] if times else begun_s, aspect)
+            begun_s += options.interval_s or 1.0
+
+
+def _is_video(path: str) -> bool:
+    """Whether a file is a video: by its name, or because it is no picture and OpenCV plays it."""
+    suffix = Path(path).suffix.lower()
+    if suffix in SUFFIXES or not Path(path).is_file():
+        return False
+    with Path(path).open("rb") as file:
+        is_text = b"\0" not in file.read(_HEAD_BYTES)  # a list of other files to play, maybe
+    return suffix in VIDEOS or (not (is_text or is_raster(path)) and cv2.VideoCapture(path, cv2.CAP_FFMPEG).isOpened())
+
+
+def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[float]]:
+    """Return images in the order of their times, and their times; none where EXIF does not have all of them.
+
+    Frames of one second are spread over it, where EXIF has whole ones.
+    """
+    if options.interval_s is not None or len(paths) < 2:
+        return paths, []
+    taken = [read_time(path) for path in paths]
+    known = [time for time in taken if time is not None]
+    if len(known) < len(paths) or len({*known}) == 1:
+        _LOG.warning("images are taken to be 1 s apart: not all of them have times of EXIF; --interval says otherwise")
+        return paths, []
+    order = sorted(range(len(paths)), key=known.__getitem__)
+    if order != [*range(len(paths))]:
+        _LOG.warning("frames come in the order of their times, by EXIF, not of their names")
+    of_one = Counter(known)
+    seconds = [known[k] + known[:k].count(known[k]) / of_one[known[k]] for k in order]
+    return [paths[k] for k in order], [time - seconds[0] for time in seconds]
 
 
 def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 0.0) -> Generator[_Image, None, float]:
@@ -171,15 +223,25 @@ def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="roadgeo-"))
     video = cv2.VideoCapture(path)
     stack.callback(video.release)
-    rate = video.get(cv2.CAP_PROP_FPS)
-    if not video.isOpened() or not 0.01 < rate < 10_000:
+    if not video.isOpened():
         raise MaskError(f"{path}: no video that OpenCV reads; give its frames as images")
-    taken, next_s, at_s = 0, 0.0, 0.0
+    rate, name = video.get(cv2.CAP_PROP_FPS), visible(Path(path).name)
+    step_s = 1.0 / rate if 0.01 < rate < 10_000 else 1.0 / _USUAL_RATE
+    aspect = options.aspect or _aspect_of(video, name)
+    taken, next_s, at_s, shift_s = 0, 0.0, -step_s, 0.0
     for k in range(1 << 31):
         if not video.grab():
             break
         # Frames of phones and links come at no fixed rate; where the container states no time, they do.
-        at_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0 or k / rate
+        stamp_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        now_s = stamp_s + shift_s if stamp_s > 0.0 else at_s + step_s
+        if now_s < at_s - 1e-6:  # two recordings in one file, a link that was cut, or a counter at its end
+            _LOG.warning(
+                "%s: its time stamps fall back by %.1f s; its times go on from %.1f s", name, at_s - now_s, at_s
+            )
+            shift_s += at_s + step_s - now_s
+            now_s = at_s + step_s
+        at_s = now_s
         if at_s + 1e-9 < next_s:
             continue
         next_s = at_s + options.every_s
@@ -190,10 +252,20 @@ def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 
         with writing(target):  # OpenCV does not report a full disk
             Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
-        yield _Image(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, stays=False)
+        yield _Image(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, aspect, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
-    return begun_s + at_s + 1.0 / rate
+    return begun_s + at_s + step_s
+
+
+def _aspect_of(video: cv2.VideoCapture, name: str) -> float:
+    """Return how many times the pixels of a video are as wide as high, as its container says."""
+    aspect = stretch_of(video.get(cv2.CAP_PROP_SAR_NUM), video.get(cv2.CAP_PROP_SAR_DEN)) or 1.0
+    if video.get(cv2.CAP_PROP_ORIENTATION_AUTO) and video.get(cv2.CAP_PROP_ORIENTATION_META) % 180:
+        aspect = 1.0 / aspect  # OpenCV has turned the frames
+    if aspect != 1.0:
+        _LOG.warning("%s: a pixel is %.3g times as wide as high, as it states; --aspect 1 says no", name, aspect)
+    return aspect
 
 
 def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
@@ -204,7 +276,8 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
     try:
         if not of_photographs:
             try:
-                return read_mask(image.path, band=reading.band, threshold=reading.threshold, name=image.name), None
+                mask = read_mask(image.path, band=reading.band, threshold=reading.threshold, name=image.name)
+                return _squared(mask, image), None
             except PhotographError:
                 if reading.segment == "never":
                     raise
@@ -216,7 +289,15 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
         blank = _blank(image)
         if blank is None:
             raise
-        return blank, None
+        return _squared(blank, image), None
+
+
+def _squared(mask: RoadMask, image: _Image) -> RoadMask:
+    """Return a mask with square pixels."""
+    if image.aspect == 1.0:
+        return mask
+    wide, high = image.stretch
+    return resampled(mask, (round(high * mask.shape[0]), round(wide * mask.shape[1]))).mask
 
 
 def _blank(image: _Image) -> RoadMask | None:
@@ -240,7 +321,8 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
 
     reading = options.reading
     network = load_model(reading.segmenter, reading.class_name, reading.threads)
-    with open_photograph(image.path, reading.bands) as photograph:
+    with open_photograph(image.path, reading.bands) as opened:
+        photograph = opened.stretched(*image.stretch)
         if last.scale is None:
             known = options.gsd_m
             ways = (
@@ -258,12 +340,13 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
 
 
 def _motion(
-    name: str, mask: RoadMask, grey: AnyArray | None, options: FrameOptions, last: _Last
+    image: _Image, mask: RoadMask, grey: AnyArray | None, options: FrameOptions, last: _Last
 ) -> tuple[FloatArray | None, float]:
     """Return how a frame moved against the one before, and how far off that may put a corner, pixels."""
     if options.motion is not None:
-        found = options.motion.get(name, options.motion.get(Path(name).stem))
-        return found, 1.5
+        found = options.motion.get(image.name, options.motion.get(Path(image.name).stem))
+        square = np.diag([*image.stretch, 1.0])  # what the user knows of pixels as they are stored
+        return None if found is None else square @ found @ np.linalg.inv(square), 1.5
     if last.mask is None or last.mask.shape != mask.shape:
         last.odometer = Odometer()  # another camera: the previous motion does not apply
         return None, 1.5

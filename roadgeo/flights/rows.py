@@ -46,7 +46,7 @@ class Row:
     heading_deg : float
         Direction of the image's up, clockwise from true north.
     homography : (3, 3) float64 or None
-        Pixel (column, row) to `crs`.
+        Pixel (column, row) of the file to `crs`.
     camera : CameraPlace or None
         Where the camera was; None unless its focal length was given.
     """
@@ -114,7 +114,7 @@ def _row(tracked: Tracked, begun: datetime | None, focal_px: float | None) -> Ro
     up = pose.homography.jacobian(pose.frame.center) @ (0.0, -1.0)
     heading = math.degrees(math.atan2(up[0], up[1])) + grid_north(plane, ground[4])
     inexact = exactness(plane.crs, LONLAT, lonlat[4].tolist()).sigma_m
-    matrix = plane.to_crs_matrix() @ pose.homography.matrix
+    matrix = plane.to_crs_matrix() @ pose.homography.matrix @ np.diag([*frame.stretch, 1.0])
     return Row(
         *bare,
         tracked.reference.name,

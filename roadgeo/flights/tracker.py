@@ -79,6 +79,8 @@ class FlightFrame:
         Pixel of this frame to pixel of the one before; None: not known.
     motion_px : float
         Standard deviation of where it puts a corner.
+    stretch : (2,) tuple of float
+        Columns and rows for each of the frame's file, whose pixels may not be square.
     """
 
     number: int
@@ -87,6 +89,7 @@ class FlightFrame:
     mask: RoadMask
     motion: FloatArray | None = None
     motion_px: float = 1.5
+    stretch: tuple[float, float] = (1.0, 1.0)
 
     @property
     def frame(self) -> Frame:

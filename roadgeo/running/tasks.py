@@ -9,29 +9,50 @@ import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from roadgeo._text import visible
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import JSON, is_result, result_endings
 from roadgeo.running.probability_files import ENDING, is_ours
-from roadgeo.storage.rasters import RAW
 
-__all__ = ["SUFFIXES", "Task", "find_masks", "in_natural_order", "name_tasks"]
+__all__ = ["SUFFIXES", "VIDEOS", "Task", "find_masks", "in_natural_order", "name_tasks"]
 
 _LOG = logging.getLogger(__name__)
 
 #: Suffixes of the files that a folder is searched for, as `storage.rasters` reads them.
 SUFFIXES = (
     *(".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".jfif", ".jp2", ".j2k", ".webp", ".png", ".bmp", ".gif"),
-    *(".pgm", ".ppm", ".pnm", ".vrt", ".img", ".npy"),
+    *(".pgm", ".ppm", ".pnm", ".vrt", ".img", ".npy", ".j2c", ".jpc", ".jpf", ".jpx", ".dib", ".btf", ".tf8", ".gtiff"),
 )
-#: Suffixes of pictures that are not read.
-_NOT_READ = (
-    *(".heic", ".heif", ".avif", ".jxl", ".svg", ".psd", ".exr", ".tga", ".ecw", ".sid"),
-    *RAW,
+#: Suffixes of videos as cameras, phones and links write them, of which `track` takes frames.
+VIDEOS = (
+    *(".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv", ".mts", ".m2ts", ".m2t", ".mod"),
+    *(".tod", ".vob", ".3gp", ".3gpp", ".3g2", ".flv", ".f4v", ".lrv", ".insv", ".360", ".asf", ".ogv", ".ogm", ".mxf"),
+    *(".dv", ".m1v", ".m2v", ".mpv", ".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".ivf", ".av1", ".mjpeg"),
+    *(
+        ".mjpg",
+        ".y4m",
+        ".nut",
+        ".divx",
+        ".xvid",
+        ".rm",
+        ".rmvb",
+        ".qt",
+        ".mpe",
+        ".mp4v",
+        ".trp",
+        ".wtv",
+        ".gxf",
+        ".amv",
+    ),
+)
+#: What lies beside pictures, and nobody expects to be one: world files, side files, indexes, text.
+_BESIDE = re.compile(
+    r"\.(\w{1,4}w|wld|prj|qpj|xml|xmp|ovr|msk|aux|rrd|qml|qgs|qgz|index|txt|md|csv|tsv|json|html?|log|ya?ml|toml|srt)"
 )
 
 #: File systems take names of 255 bytes; outputs, and their temporary names, need the rest.
@@ -55,7 +76,7 @@ def find_masks(arguments: Sequence[str], recursive: bool = False, suffixes: tupl
     """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest.
 
     Numbers in names count as numbers: frame_2 comes before frame_10. Images in folders within folders are found with
-    `recursive`; else a message mentions them. Another mentions pictures of formats that are not read.
+    `recursive`; else a message mentions them. Another mentions what is passed over: other formats, videos.
     """
     found: list[str] = []
     for argument in arguments:
@@ -63,26 +84,48 @@ def find_masks(arguments: Sequence[str], recursive: bool = False, suffixes: tupl
             found += _images_in(Path(argument), recursive, suffixes)
         elif glob.has_magic(argument) and not Path(argument).exists():
             names = glob.glob(argument, recursive=True)  # noqa: PTH207 (patterns may be absolute)
-            found += sorted(names, key=in_natural_order) or [argument]
+            found += _in_order(names) or [argument]
         else:
             found.append(argument)
     return found
 
 
-def in_natural_order(name: str) -> list[str | int]:
-    """Return a key by which names are sorted as people count: numbers within them by their values."""
-    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name))]
+def in_natural_order(name: str, decimals: bool = True) -> list[str | tuple[int, str]]:
+    """Return a key by which names are sorted as people count: numbers within them by their values.
+
+    One point between two numbers makes a decimal, where `decimals` says so; more of them part a date or a version.
+    """
+    number = r"((?<![\d.])\d+\.\d+(?!\.?\d)|\d+)" if decimals else r"(\d+)"
+    parts = [part.partition(".") if k % 2 else part for k, part in enumerate(re.split(number, name))]
+    return [part if isinstance(part, str) else (int(part[0]), part[2]) for part in parts]
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Sort names, and say so where decimals in them may mean something else."""
+    found = sorted(names, key=in_natural_order)
+    whole = sorted(found, key=partial(in_natural_order, decimals=False))
+    if found != whole:
+        first = next(k for k, (one, other) in enumerate(zip(found, whole, strict=True)) if one != other)
+        _LOG.warning(
+            "numbers in names are read as decimals: %s comes before %s; where digits after the point are whole numbers "
+            "(of nanoseconds, say), give them as many digits each",
+            *(visible(Path(name).name) for name in (found[first], whole[first])),
+        )
+    return found
 
 
 def _images_in(folder: Path, recursive: bool, suffixes: tuple[str, ...]) -> list[str]:
     """Return the images of a folder, and of all within it, but for results; mention what is passed over."""
     endings, names = result_endings(), [name for name in _walk(folder) if not Path(name).name.startswith(".")]
     here = [name for name in names if recursive or Path(name).parent == folder]
-    unread = Counter(Path(name).suffix.lower() for name in here if Path(name).suffix.lower() in _NOT_READ)
-    if unread:
-        listed = ", ".join(f"{n} {suffix}" for suffix, n in unread.items())
-        _LOG.warning("%s: passed over: %s: formats that are not read; convert them", visible(str(folder)), listed)
     images = [name for name in names if _is_mask(Path(name), endings, suffixes)]
+    unread = Counter(_suffix(name) for name in {*here} - {*images} if not _is_beside(Path(name), endings))
+    if unread:
+        listed = ", ".join(f"{n} {suffix}" for suffix, n in sorted(unread.items()))
+        hint = "formats that are not read from a folder; convert them, or give them by name"
+        if unread.keys() & {*VIDEOS} - {*suffixes}:
+            hint = "of videos take frames, or follow them with `roadgeo track`"
+        _LOG.warning("%s: passed over: %s: %s", visible(str(folder)), visible(listed), hint)
     beyond = [] if recursive else [name for name in images if Path(name).parent != folder]
     if beyond:
         _LOG.warning(
@@ -98,7 +141,18 @@ def _walk(folder: Path) -> list[str]:
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         found += [str(Path(root, name)) for name in names]
-    return sorted(found, key=in_natural_order)
+    return _in_order(found)
+
+
+def _suffix(name: str) -> str:
+    return Path(name).suffix.lower() or "without a suffix"
+
+
+def _is_beside(path: Path, endings: tuple[str, ...]) -> bool:
+    """Whether a file is a result, a reference, or lies beside others; or it is a mask that we wrote."""
+    is_reference = path.suffix == ".gpkg" and path.with_suffix(".index").exists()
+    is_mask = path.suffix.lower() in SUFFIXES
+    return is_mask or is_reference or is_result(path.name, endings) or bool(_BESIDE.fullmatch(path.suffix.lower()))
 
 
 def _is_mask(path: Path, endings: tuple[str, ...], suffixes: tuple[str, ...]) -> bool:

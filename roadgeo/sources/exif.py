@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 import re
+from datetime import UTC, datetime
 
 from roadgeo.errors import MaskError
+from roadgeo.storage.orientation import read_tag
 from roadgeo.storage.rasters import open_raster, raster_size
 
-__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length"]
+__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length", "read_time"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
 _FOCAL = "EXIF_FocalLengthIn35mmFilm"
+_EXIF, _TAKEN, _PART_OF_SECOND = 0x8769, 0x9003, 0x9291
 
 
 def read_focal_length(path: str | os.PathLike[str]) -> float:
@@ -59,6 +62,16 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
     if not (1.0 <= focal <= 5000.0 and 5.0 <= height <= 100_000.0):
         return None
     return height * FILM_WIDTH_MM / focal / max(raster_size(path))
+
+
+def read_time(path: str | os.PathLike[str]) -> float | None:
+    """Return when a photograph was taken by its own clock, seconds since 1970; None where EXIF does not say."""
+    taken, part = (read_tag(path, tag, _EXIF) for tag in (_TAKEN, _PART_OF_SECOND))
+    try:
+        moment = datetime.strptime(str(taken), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return moment.timestamp() + _number(f"0.{part or 0}")
 
 
 def _tags(path: str | os.PathLike[str]) -> tuple[dict[str, str], str]:

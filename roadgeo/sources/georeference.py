@@ -10,9 +10,9 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
-from roadgeo.geometry.georeference import Georeference, fit_place
+from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
 from roadgeo.storage.crs import crs_name, name_crs
-from roadgeo.storage.orientation import read_orientation, stored_from_upright
+from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
 from roadgeo.storage.rasters import open_raster
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["read_georeference", "read_pixel_shape", "read_stated_middle"]
 
+_STEPS_ASIDE = 4  # orientations beyond this make rows of columns
 _WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
 _HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
@@ -67,9 +68,17 @@ def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | No
 
 
 def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:
-    """Return the shape of a raster's pixels as `Georeference.pixel_shape`; (None, False) where it states none."""
+    """Return the shape of a raster's pixels as `Georeference.pixel_shape`; (None, False) where it states none.
+
+    Without a georeference its resolution counts, as scanners and facsimiles state it.
+    """
     found = _stated(path)
-    return (None, False) if found is None or found.source == "control points" else found.pixel_shape()
+    if found is None:
+        across, down = read_resolution(path)
+        aspect = stretch_of(down, across)
+        turned = read_orientation(path) > _STEPS_ASIDE
+        return (1.0 / aspect if aspect and turned else aspect), False
+    return (None, False) if found.source == "control points" else found.pixel_shape()
 
 
 def _stated(path: str | os.PathLike[str]) -> Georeference | None:

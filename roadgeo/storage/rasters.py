@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_SIDE",
     "RAW",
+    "is_raster",
     "name_page",
     "open_raster",
     "page_of",
@@ -242,6 +243,13 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
 
 #: Suffixes of images, which no text has.
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jp2", ".bmp", ".gif"}
+
+
+def is_raster(path: str | os.PathLike[str]) -> bool:
+    """Whether a file begins as a format that is read here."""
+    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+        head = file.read(_HEAD_BYTES)
+    return head.startswith(_ARRAY) or any(re.match(magic, head, re.DOTALL) for magic, _ in _DRIVERS)
 
 
 def _drivers(path: Path, name: str, more: list[str]) -> list[str]:

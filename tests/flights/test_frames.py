@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from flights.test_motion import MOTION, gap, seen, streets
 from worlds.models import brightness_model
@@ -134,15 +135,18 @@ def test_what_is_no_video_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[s
 class Recording:
     """Stands for a video of OpenCV's: frames at times, seconds; the rate that it states is another."""
 
-    def __init__(self, times: list[float]) -> None:
+    def __init__(self, times: list[float], **stated: float) -> None:
         self.times, self.at = times, -1
+        self.stated = {getattr(cv2, f"CAP_PROP_{name.upper()}"): value for name, value in stated.items()}
 
     def grab(self) -> bool:
         self.at += 1
         return self.at < len(self.times)
 
     def get(self, what: int) -> float:
-        return 10.0 if what == cv2.CAP_PROP_FPS else 1000.0 * self.times[self.at]
+        if what == cv2.CAP_PROP_POS_MSEC:
+            return 1000.0 * self.times[self.at]
+        return self.stated.get(what, 10.0 if what == cv2.CAP_PROP_FPS else 0.0)
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
         return True, np.zeros((64, 64, 3), np.uint8)
@@ -168,6 +172,108 @@ def test_frames_of_videos_have_their_own_times_and_files_follow_one_another(
         *(("DJI_2_000000", 3.2), ("DJI_2_000001", 4.7)),
         *(("DJI_10_000000", 4.8), ("DJI_10_000001", 6.8), ("DJI_11.png", 6.9)),
     ]
+
+
+@pytest.mark.parametrize(
+    ("times", "rate", "right", "message"),
+    [
+        ([0.0, 0.5, 1.0, 0.0, 0.5, 1.0], 2.0, [0.0, 0.5, 1.0, 1.5, 2.0, 2.5], "fall back by 1.0 s"),  # joined by cat
+        ([0.0, 0.5, 1.0, 0.3, 0.8], 2.0, [0.0, 0.5, 1.0, 1.5, 2.0], "fall back by 0.7 s"),  # a link that was cut
+        ([95442.7, 95443.2, 0.0, 0.5], 2.0, [95442.7, 95443.2, 95443.7, 95444.2], "go on from 95443.7"),  # 33 bits
+        ([0.0, 0.0, 0.0], 4.0, [0.0, 0.25, 0.5], ""),  # a stream without times
+        ([0.0, 0.0, 0.0], 90_000.0, [0.0, 0.04, 0.08], ""),  # and with no rate that makes sense
+        ([0.0, 0.5, 0.5, 1.0], 2.0, [0.0, 0.5, 0.5, 1.0], ""),
+    ],
+)
+def test_times_of_a_video_go_on_and_no_frame_is_lost(
+    times: list[float], rate: float, right: list[float], message: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Recording(times, fps=rate))
+    (tmp_path / "a.ts").touch()
+    read = [round(frame.time_s, 3) for frame in read_frames([str(tmp_path / "a.ts")], FrameOptions(every_s=0.0))]
+    assert read == sorted(read)
+    assert read[:3] == right[:3]
+    assert len(read) == len(right)
+    assert message in caplog.text
+
+
+STRETCHED = [
+    ({"sar_num": 4.0, "sar_den": 3.0}, (64, 85)),
+    ({"sar_num": 8.0, "sar_den": 9.0}, (72, 64)),
+    ({"sar_num": 4.0, "sar_den": 3.0, "orientation_meta": 90.0, "orientation_auto": 1.0}, (85, 64)),
+    ({"sar_num": 0.0, "sar_den": 1.0}, (64, 64)),
+    ({"sar_num": 0.0, "sar_den": 0.0}, (64, 64)),
+]
+
+
+@pytest.mark.parametrize(("stated", "shape"), STRETCHED)
+def test_pixels_of_a_video_are_as_wide_as_its_container_says(
+    stated: dict[str, float], shape: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Recording([0.0], **stated))
+    (tmp_path / "a.mov").touch()
+    (frame,) = read_frames([str(tmp_path / "a.mov")])
+    assert frame.mask.shape == shape
+    assert [64 * each for each in frame.stretch[::-1]] == pytest.approx(shape, abs=0.5)
+    (frame,) = read_frames([str(tmp_path / "a.mov")], FrameOptions(aspect=2.0))
+    assert frame.mask.shape == (64, 128)
+
+
+@pytest.mark.parametrize("kind", ["mask", "photograph"])
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
+def test_pixels_of_images_are_as_wide_as_their_resolution_says(
+    kind: str, suffix: str, model: FrameOptions, photographs: list[str], tmp_path: Path
+) -> None:
+    picture = cv2.imread(photographs[0])[..., ::-1] if kind == "photograph" else streets()
+    squeezed = cv2.resize(picture, None, fx=0.5, fy=1.0, interpolation=cv2.INTER_AREA)
+    PIL.Image.fromarray(squeezed).save(tmp_path / f"a.{suffix}", dpi=(100, 200), quality=95)
+    (frame,) = read_frames([str(tmp_path / f"a.{suffix}")], model)
+    assert frame.mask.shape == picture.shape[:2]
+    PIL.Image.fromarray(squeezed).save(tmp_path / f"b.{suffix}", dpi=(100, 200), quality=95)
+    given = replace(model, motion={f"b.{suffix}": shift(5.0, 0.0)})
+    _, second = read_frames([str(tmp_path / f"{name}.{suffix}") for name in "ab"], given)
+    assert second.motion[0, 2] == pytest.approx(10.0)  # pixels of the file are twice as wide
+
+
+def save_taken(path: Path, taken: str | None, part: str = "") -> None:
+    """Write a picture that was taken at a time, by EXIF."""
+    exif = PIL.Image.Exif()
+    if taken is not None:
+        exif[0x8769] = {0x9003: taken, **({0x9291: part} if part else {})}
+    PIL.Image.fromarray(streets()).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "webp", "png"])
+def test_images_have_the_times_of_exif_where_all_do(
+    suffix: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = [tmp_path / f"DSC_{name}.{suffix}" for name in ("9998", "9999", "0001", "0002", "0003")]
+    stamps = [("58", "25"), ("59", "5"), ("00", ""), ("00", ""), ("00", "")]
+    for name, (second, part) in zip(names, stamps, strict=True):
+        save_taken(name, f"2024:05:01 09:{30 + (second == '00')}:{second}", part)
+    read = list(read_frames([str(tmp_path)]))
+    assert [frame.name for frame in read] == [name.name for name in names]
+    assert [frame.time_s for frame in read] == pytest.approx([0.0, 1.25, 1.75, 1.75 + 1 / 3, 1.75 + 2 / 3], abs=1e-3)
+    assert "in the order of their times" in caplog.text
+    told = read_frames([str(tmp_path)], FrameOptions(interval_s=2.0))
+    assert [frame.time_s for frame in told] == [0.0, 2.0, 4.0, 6.0, 8.0]
+    save_taken(names[1], None)
+    caplog.clear()
+    assert [frame.time_s for frame in read_frames([str(tmp_path)])] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert "taken to be 1 s apart" in caplog.text
+
+
+def test_a_video_is_known_by_its_content_too(tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 2.0, (320, 240))
+    for _ in range(3):
+        writer.write(np.full((240, 320, 3), 255, np.uint8))
+    writer.release()
+    (tmp_path / "a.avi").rename(tmp_path / "REC00001.PIO")
+    assert len(list(read_frames([str(tmp_path / "REC00001.PIO")], FrameOptions(every_s=0.0)))) == 3
+    (tmp_path / "list.PIO").write_text("#EXTM3U\n#EXTINF:1,\nREC00001.PIO\n")
+    with pytest.raises(MaskError, match="not a raster"):
+        list(read_frames([str(tmp_path / "list.PIO")]))
 
 
 def test_names_in_the_order_of_text_are_mentioned(masks: list[str], caplog: pytest.LogCaptureFixture) -> None:

@@ -18,7 +18,7 @@ from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
 from roadgeo.running.batch import Asked, Locating, Outcome
 from roadgeo.running.options import BatchOptions
-from roadgeo.running.tasks import Task, find_masks, name_tasks
+from roadgeo.running.tasks import SUFFIXES, VIDEOS, Task, find_masks, name_tasks
 
 
 def test_folders_and_patterns_are_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,8 +70,45 @@ def test_formats_that_are_read_by_name_are_taken_from_folders_and_others_are_men
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     assert find_masks([str(tmp_path)]) == [str(tmp_path / name) for name in ("a.gif", "b.ppm", "c.JFIF")]
-    passed = "passed over: 2 .heic, 1 .dng: formats that are not read; convert them"
+    passed = "passed over: 1 .dng, 2 .heic: formats that are not read from a folder; convert them, or give them by name"
     assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {passed}"]
+
+
+@pytest.mark.parametrize("suffix", [".MTS", ".m2ts", ".3gp", ".flv", ".h264", ".LRV", ".mp4", ".265", ".insv", ".vob"])
+def test_videos_are_taken_where_they_are_wanted_and_mentioned_elsewhere(
+    suffix: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in (f"a{suffix}", "a.SRT", "b.zip", "c", "d.png", "d.pgw", "d_location.gpkg"):
+        (tmp_path / name).touch()
+    assert find_masks([str(tmp_path)], suffixes=SUFFIXES + VIDEOS) == [
+        str(tmp_path / f"a{suffix}"),
+        str(tmp_path / "d.png"),
+    ]
+    assert caplog.records[0].getMessage().startswith(f"{tmp_path}: passed over: 1 .zip, 1 without a suffix: formats")
+    assert find_masks([str(tmp_path)]) == [str(tmp_path / "d.png")]
+    assert f"1 {suffix.lower()}, 1 .zip" in caplog.text or f"1 .zip, 1 {suffix.lower()}" in caplog.text
+    assert "roadgeo track" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("names", "is_doubtful"),
+    [
+        (["1403636570.0", "1403636570.25", "1403636570.5", "1403636570.75", "1403636571.0"], True),
+        (["at_9.25m", "at_9.5m", "at_10.0m", "at_10.125m"], True),
+        (["1403636570.000", "1403636570.250", "1403636571.000"], False),
+        (["v1.2.9", "v1.2.10"], False),
+        (["2024.5.1", "2024.5.12", "2024.10.1"], False),
+        (["f.9", "f.10"], False),
+    ],
+)
+def test_decimals_in_names_count_as_decimals(
+    names: list[str], is_doubtful: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").touch()
+    right = [str(tmp_path / f"{name}.png") for name in names]
+    assert find_masks([str(tmp_path)]) == find_masks([str(tmp_path / "*.png")]) == right
+    assert ("are read as decimals" in caplog.text) == is_doubtful
 
 
 def test_results_never_share_a_name() -> None:

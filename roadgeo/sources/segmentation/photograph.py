@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -52,6 +52,16 @@ class Photograph:
     height: int
     read: Callable[[float, float, float, float, tuple[int, int]], tuple[AnyArray, BoolArray]]
     page: str = ""
+
+    def stretched(self, wide: float, high: float) -> Photograph:
+        """Return the same with so many columns and rows for each of its own."""
+
+        def read(
+            left: float, top: float, width: float, height: float, shape: tuple[int, int]
+        ) -> tuple[AnyArray, BoolArray]:
+            return self.read(left / wide, top / high, width / wide, height / high, shape)
+
+        return replace(self, width=round(wide * self.width), height=round(high * self.height), read=read)
 
 
 @contextmanager
