@@ -206,7 +206,7 @@ class _Layout(NamedTuple):
         """Return where the entries of a directory begin, and how many they are."""
         file.seek(self.start + at)
         width = struct.calcsize(self.order + self.entry_count)
-        return self.start + at + width, struct.unpack(self.order + self.count, file.read(width))[0]
+        return self.start + at + width, struct.unpack(self.order + self.entry_count, file.read(width))[0]
 
     def next(self, file: BinaryIO, at: int) -> int:
         """Return where the next directory begins; 0: there is none."""
