@@ -12,6 +12,7 @@ from pathlib import Path
 __all__ = [
     "CONSENT",
     "NETWORK",
+    "OWN_SHIFT",
     "SEALED",
     "allowed_drivers",
     "forget_missing_proj_data",
@@ -32,8 +33,11 @@ NETWORK = {
     "GDAL_HTTPS_PROXY": "127.0.0.1:0",
 }
 
+#: A datum shift that a file states is its own: GDAL leaves it out where the datum has a number of EPSG's.
+OWN_SHIFT = {"OSR_STRIP_TOWGS84": "NO"}
+
 #: Settings under which rasters are opened: no siblings (.ovr, .msk, .aux.xml, world files) and no network.
-SEALED = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", **NETWORK}
+SEALED = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", **OWN_SHIFT, **NETWORK}
 
 
 def skip_drivers() -> None:

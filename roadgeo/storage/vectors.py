@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.storage.crs_guard import refuse_named_files
-from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
+from roadgeo.storage.gdal import CONSENT, NETWORK, OWN_SHIFT, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = ["VectorLayer", "describe_layer", "first_line", "list_layers", "read_layer", "require_file"]
@@ -185,10 +185,15 @@ def _few_drivers() -> Iterator[None]:
 
 @contextmanager
 def _offline() -> Iterator[None]:
-    """Let no request of pyogrio's GDAL reach anything."""
+    """Let no request of pyogrio's GDAL reach anything; a file's own datum shift stays."""
     import pyogrio
 
-    options = {**NETWORK, "GML_DOWNLOAD_SCHEMA": "NO", "DXF_INLINE_BLOCKS": "NO"}  # blocks within blocks have no end
+    options = {
+        **NETWORK,
+        **OWN_SHIFT,
+        "GML_DOWNLOAD_SCHEMA": "NO",
+        "DXF_INLINE_BLOCKS": "NO",
+    }  # blocks within blocks have no end
     before = {name: pyogrio.get_gdal_config_option(name) for name in options}
     exempt = {name: os.environ.pop(name) for name in ("no_proxy", "NO_PROXY") if name in os.environ}
     pyogrio.set_gdal_config_options(options)

@@ -1,21 +1,25 @@
 """Georeferences of rasters: read from every place where they may stand, and moved."""
 
+import warnings
 from pathlib import Path
 
 import cv2
+import geopandas as gpd
 import numpy as np
 import PIL.Image
 import pyproj
 import pytest
 import rasterio
+import shapely
 from rasterio.control import GroundControlPoint
 from worlds.rasters import write_raster
-from worlds.turned import save_turned
+from worlds.turned import mark_turned, save_turned
 
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import LocalPlane, transformer
+from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
 from roadgeo.sources.georeference import read_georeference, read_pixel_shape
+from roadgeo.sources.roads import choose_roads
 
 PLACE = rasterio.Affine(0.5, 0.1, 330_000.0, 0.1, -0.5, 4_690_000.0)
 PLANE = LocalPlane("EPSG:32619", (330_000.0, 4_690_000.0))
@@ -121,23 +125,40 @@ SHIFTED = {
     "utm, far": "+proj=utm +zone=29 +ellps=intl +towgs84=-231,-196.1,482.2 +units=m",
     "degrees": "+proj=longlat +ellps=bessel +towgs84=582,105,414,1.04,0.35,-3.08,8.3",
     "gauss-krueger": "+proj=tmerc +lon_0=9 +x_0=3500000 +ellps=bessel +towgs84=598.1,73.7,418.2,.202,.045,-2.455,6.7",
+    "of a datum with a number": (
+        'PROJCS["ED50 / UTM zone 29N",GEOGCS["ED50",DATUM["European_Datum_1950",'
+        'SPHEROID["International 1924",6378388,297],TOWGS84[-223.237,110.193,36.649,0,0,0,0],'
+        'AUTHORITY["EPSG","6230"]],PRIMEM["Greenwich",0],UNIT["degree",'
+        '0.0174532925199433]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],PARAMETER['
+        '"central_meridian",-9],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],PARAMETER['
+        '"false_northing",0],UNIT["metre",1]]'
+    ),
     "of no name": "+proj=utm +zone=29 +ellps=intl +units=m",
 }
 
 
-@pytest.mark.parametrize("where", ["geotransform", "control points", "prj"])
+@pytest.mark.parametrize("where", ["geotransform", "control points", "turned", "jp2", "img", "prj"])
 @pytest.mark.parametrize("name", SHIFTED)
 def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: str) -> None:
+    if (name, where) == ("of no name", "img"):
+        pytest.skip("Imagine names its datum")
     crs = pyproj.CRS(SHIFTED[name])
     west, north = pyproj.Transformer.from_crs(4326, crs, always_xy=True).transform(-8.6, 41.15)
     step = 1e-5 if name == "degrees" else 1.0
     place = rasterio.Affine(step, 0, west, 0, -step, north)
-    if where == "geotransform":
-        path = write(tmp_path / "a.tif", crs=crs.to_wkt(), transform=place)
-    elif where == "control points":
+    named = crs.to_wkt("WKT1_GDAL") if "number" in name else crs.to_wkt()
+    kept = rasterio.Env(OSR_STRIP_TOWGS84="NO")  # as other programs write
+    if where in ("geotransform", "jp2", "img"):
+        driver = {"jp2": {"driver": "JP2OpenJPEG"}, "img": {"driver": "HFA"}}.get(where, {})
+        with kept:
+            path = write(tmp_path / f"a.{where}", crs=named, transform=place, **driver)
+    elif where in ("control points", "turned"):
         spots = [(0, 0), (80, 0), (80, 60), (0, 60)]
         points = [GroundControlPoint(row, column, *at(place, column, row)) for column, row in spots]
-        path = write(tmp_path / "a.tif", gcps=points, crs=crs.to_wkt())
+        with kept:
+            path = write(tmp_path / "a.tif", gcps=points, crs=named)
+        if where == "turned":
+            mark_turned(path, 3)
     else:
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), BLACK)
@@ -148,6 +169,26 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
     middle = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform(*at(place, 40, 30))
     assert found.middle() == pytest.approx(middle, abs=1e-7)
     assert "EPSG:2" not in found.crs[:6]
+
+
+@pytest.mark.parametrize("container", ["gpkg", "shp", "fgb", "sqlite", "parquet", "frame"])
+@pytest.mark.parametrize("name", ["utm", "degrees", "of a datum with a number"])
+def test_and_so_it_is_in_maps(tmp_path: Path, name: str, container: str) -> None:
+    crs = pyproj.CRS(SHIFTED[name])
+    x, y = pyproj.Transformer.from_crs(4326, crs, always_xy=True).transform([-8.6, -8.59], [41.15, 41.16])
+    frame = gpd.GeoDataFrame({"a": [1]}, geometry=[shapely.LineString(np.c_[x, y])], crs=crs)
+    path = tmp_path / f"roads.{container}"
+    with warnings.catch_warnings(action="ignore"):
+        if container == "parquet":
+            frame.to_parquet(path)
+        elif container != "frame":
+            drivers = {"sqlite": "SQLite", "fgb": "FlatGeobuf"}
+            frame.to_file(path, engine="pyogrio", driver=drivers.get(container))
+        if container == "shp":
+            path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
+        roads = choose_roads(frame if container == "frame" else path)
+    lonlat = to_lonlat(roads.plane.crs, roads.plane.to_crs(shapely.get_coordinates(roads.lines)))
+    np.testing.assert_allclose(lonlat, [[-8.6, 41.15], [-8.59, 41.16]], atol=1e-7)
 
 
 @pytest.mark.parametrize(
