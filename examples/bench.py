@@ -226,7 +226,7 @@ def locate_all(folder: Path, city: str, record: Path) -> None:
     masks = [name for name in json.loads((folder / f"{city}.masks").read_text(encoding="utf-8")) if name not in done]
     if not masks:
         return
-    reference = roadgeo.build_reference(folder / f"{city}.parquet")
+    reference = roadgeo.index(folder / f"{city}.parquet")
     roadgeo.locate(folder / f"{masks[0]}.png", reference)  # loading counts for no mask
     with record.open("a", encoding="utf-8") as file:
         for name in masks:

@@ -10,7 +10,7 @@ import roadgeo
 from roadgeo.evaluation.demo import ROADS, demo_masks
 
 # Roads of any kind and CRS, as a GeoDataFrame of lines; here a piece of Porto that ships with roadgeo.
-reference = roadgeo.build_reference(gpd.read_file(ROADS), name="porto")
+reference = roadgeo.index(gpd.read_file(ROADS), name="porto")
 
 # A reference is built once and kept; opening it takes milliseconds, whatever its size.
 path = Path(tempfile.mkdtemp()) / "porto.gpkg"

@@ -14,7 +14,7 @@ from roadgeo.outputs.location_files import write_location
 from roadgeo.outputs.paths import output_paths
 from roadgeo.workflows import LocateOptions
 
-reference = roadgeo.build_reference(gpd.read_file(ROADS), name="porto")
+reference = roadgeo.index(gpd.read_file(ROADS), name="porto")
 folder = Path(tempfile.mkdtemp())
 
 # Options are small frozen dataclasses, one per stage, nested: replace those that you know. Each makes the search surer.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "1.0.0"
 
 if TYPE_CHECKING:
-    from roadgeo.api import Answer, build_reference, index, locate, track, vectorize, verify
+    from roadgeo.api import Answer, index, locate, track, vectorize, verify
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
@@ -39,7 +39,6 @@ __all__ = [
     "RoadgeoError",
     "ShardedReference",
     "__version__",
-    "build_reference",
     "explain",
     "index",
     "locate",
@@ -59,7 +58,6 @@ _HOMES = {
     "RoadMask": "geometry.mask",
     "RoadgeoError": "errors",
     "ShardedReference": "reference.shards",
-    "build_reference": "api",
     "explain": "workflows",
     "index": "api",
     "locate": "api",

@@ -28,67 +28,10 @@ if TYPE_CHECKING:
     from roadgeo.flights.rows import Row
     from roadgeo.running.verifying import Verified
 
-__all__ = ["Answer", "build_reference", "index", "locate", "track", "vectorize", "verify"]
+__all__ = ["Answer", "index", "locate", "track", "vectorize", "verify"]
 
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
-
-
-def build_reference(
-    roads: Any,
-    name: str = "",
-    options: BuildOptions | None = None,
-    *,
-    crs: Any = None,
-    path: str | os.PathLike[str] | None = None,
-    kinds: RoadKind = "drivable",
-    tunnels: bool = False,
-    attribution: str | None = None,
-) -> Reference:
-    """Build a reference from roads, as `roadgeo index` does.
-
-    >>> reference = roadgeo.build_reference("porto_roads.gpkg", "porto", path="city.gpkg")
-    >>> len(reference.index)
-    2649
-
-    From lines or arrays it is made by `roadgeo.build_reference(lines, "porto", crs="EPSG:32629")`.
-
-    Parameters
-    ----------
-    roads : path or paths, GeoDataFrame, GeoSeries, osmnx graph, shapely lines, arrays, or Roads
-        A path is a road file or a folder of them. Arrays are of shape (N, 2), x or longitude first, one for each line;
-        or a single one, where rows of NaN stand between the lines.
-    name : str
-        Name of the reference. Default: as the file at `path`, if that is given.
-    crs : anything that pyproj knows, optional
-        CRS of the coordinates. Needed for shapely lines and arrays, and for files without one.
-    path : path, optional
-        Write it there, REF.gpkg and REF.index, and open it from there. Default: nothing is written.
-    kinds : "main", "drivable", "vehicles" or "all"
-        Kinds of roads to take, where they have kinds (see `roadgeo.sources.schemas`).
-    tunnels : bool
-        Take tunnels too, which a mask does not show.
-    attribution : str, optional
-        Attribution beside the map, where the roads have none.
-
-    Raises
-    ------
-    CrsError, RoadSourceError
-        No CRS; no lines; fewer than three intersections.
-    OutputError
-        It cannot be written.
-    MissingPackageError
-        A package is not installed, as on an onboard computer.
-    """
-    from roadgeo.sources.roads import choose_roads
-    from roadgeo.workflows import build_reference as build
-
-    where = None if path is None else Path(path)
-    try:
-        chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
-        return build(chosen, name or (where.stem if where else ""), options, path=where)
-    except ModuleNotFoundError as error:
-        raise name_package(error) or error from error
 
 
 def index(
@@ -104,45 +47,69 @@ def index(
 ) -> Reference:
     """Build a reference of a place, or from roads, as `roadgeo index` does.
 
-    >>> reference = roadgeo.index("porto_roads.gpkg", attribution="© OpenStreetMap contributors")
+    >>> reference = roadgeo.index("porto_roads.gpkg", attribution="© OpenStreetMap contributors", path="city.gpkg")
     >>> reference
-    <Reference 'porto-roads': 2,649 intersections, EPSG:32629, not written>
+    <Reference 'city': 2,649 intersections, EPSG:32629, city.gpkg>
 
-    The roads of `roadgeo.index("Boston, MA", path="boston.gpkg")` come from OpenStreetMap.
+    The roads of `roadgeo.index("Boston, MA", path="boston.gpkg")` come from OpenStreetMap; from lines or arrays a
+    reference is made by `roadgeo.index(lines, "porto", crs="EPSG:32629")`.
 
     Parameters
     ----------
-    roads : str, or (west, south, east, north), or as of `build_reference`
-        A place that OpenStreetMap knows, where there is no file of that name; or a box in degrees.
-    name, options, crs, path, kinds, tunnels, attribution
-        As of `build_reference`.
+    roads : str, (west, south, east, north), path or paths, GeoDataFrame, osmnx graph, shapely lines, arrays, or Roads
+        A place that OpenStreetMap knows, where there is no file of that name; a box in degrees; a road file or a folder
+        of them. Arrays are of shape (N, 2), x or longitude first, one for each line; or a single one, where rows of NaN
+        stand between the lines.
+    name : str
+        Name of the reference. Default: as the file at `path`, or as what is given.
+    crs : anything that pyproj knows, optional
+        CRS of the coordinates. Needed for shapely lines and arrays, and for files without one.
+    path : path, optional
+        Write it there, REF.gpkg and REF.index, and open it from there. Default: nothing is written.
+    kinds : "main", "drivable", "vehicles" or "all"
+        Kinds of roads to take, where they have kinds (see `roadgeo.sources.schemas`).
+    tunnels : bool
+        Take tunnels too, which a mask does not show.
+    attribution : str, optional
+        Attribution beside the map, where the roads have none.
 
     Raises
     ------
     CrsError, RoadSourceError
-        As of `build_reference`; there is no such place, or no network.
+        No CRS; no lines; fewer than three intersections; no such place, or no network.
     OutputError
         It cannot be written.
+    MissingPackageError
+        A package is not installed, as on an onboard computer.
     """
+    try:
+        from roadgeo.sources.roads import choose_roads, fetch_roads
+        from roadgeo.workflows import build_reference
+
+        where = None if path is None else Path(path)
+        is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(road, int | float) for road in roads)
+        name = name or (where.stem if where else _name_of(roads, is_box))
+        if is_box or _is_place(roads):
+            chosen = fetch_roads(**{"bbox" if is_box else "place": roads}, which=kinds, tunnels=tunnels)
+        else:
+            chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
+        return build_reference(chosen, name, options, path=where)
+    except ModuleNotFoundError as error:
+        raise name_package(error) or error from error
+
+
+def _name_of(roads: Any, is_box: bool) -> str:
+    """Return a name for a place, a box or a file; nothing for other roads."""
     from roadgeo.reference.library import make_slug
 
-    is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(road, int | float) for road in roads)
-    if is_box or (isinstance(roads, str) and _is_place(roads)):
-        from roadgeo.sources.roads import fetch_roads
-
-        name = name or (Path(path).stem if path else "box" if is_box else make_slug(roads))
-        where = {"bbox" if is_box else "place": roads}
-        roads = fetch_roads(**where, which=kinds, tunnels=tunnels)
-    elif not name and path is None and isinstance(roads, str | os.PathLike):
-        name = make_slug(Path(roads).name.split(".")[0])
-    return build_reference(
-        roads, name, options, crs=crs, path=path, kinds=kinds, tunnels=tunnels, attribution=attribution
-    )
+    if not isinstance(roads, str | os.PathLike):
+        return "box" if is_box else ""
+    return make_slug(str(roads) if _is_place(roads) else Path(roads).name.split(".")[0])
 
 
-def _is_place(text: str) -> bool:
-    """Whether a text is the name of a place rather than of a file: none is there, and it does not end like one."""
-    return not Path(text).exists() and not re.search(r"[/\\]|\.\w{2,9}$", text)
+def _is_place(roads: Any) -> bool:
+    """Whether what is given names a place, not a file: none is there, and it does not end like one."""
+    return isinstance(roads, str) and not Path(roads).exists() and not re.search(r"[/\\]|\.\w{2,9}$", roads)
 
 
 def locate(

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def porto() -> roadgeo.Reference:
-    return roadgeo.build_reference(ROADS, "porto")
+    return roadgeo.index(ROADS, "porto")
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_references_go_by_path_and_by_name(
 
 def test_an_answer_says_what_was_asked_and_of_which_map(porto: roadgeo.Reference, tmp_path: Path) -> None:
     """As the JSON of the command line does, but for the command."""
-    built = roadgeo.build_reference(ROADS, path=tmp_path / "city.gpkg")
+    built = roadgeo.index(ROADS, path=tmp_path / "city.gpkg")
     assert repr(built) == f"<Reference 'city': 2,649 intersections, EPSG:32629, {tmp_path / 'city.gpkg'}>"
     found = roadgeo.locate(DRONE, built, QUICK, gsd=1.0)
     assert found.options == {"effort": "quick", "match": {"camera": {"gsd_m": [0.8, 1.25]}}}
@@ -125,8 +125,8 @@ def test_a_photograph_goes_the_way_of_the_command_line(
     from roadgeo.running import queries
     from roadgeo.running.looks import Sighting
 
-    def segmented(paths: tuple[str, ...], *_: object) -> Sighting:
-        return Sighting(roadgeo.Location(paths[0], "not_located", "hardly a road"), roadgeo.RoadMask(np.zeros((9, 9))))
+    def segmented(path: str, *_: object) -> Sighting:
+        return Sighting(roadgeo.Location(path, "not_located", "hardly a road"), roadgeo.RoadMask(np.zeros((9, 9))))
 
     monkeypatch.setattr(queries, "locate_photograph", segmented)
     found = roadgeo.locate(PHOTO, porto)
@@ -172,10 +172,10 @@ def test_photographs_that_are_no_files_are_segmented_as_files_are(
     given = {"array": photograph, "floats": photograph / 255.0, "PIL": Image.fromarray(photograph)}[kind]
     read: list[np.ndarray] = []
 
-    def segmented(paths: tuple[str, ...], *_: object) -> Sighting:
-        with rasterio.open(paths[0]) as file:
+    def segmented(path: str, *_: object) -> Sighting:
+        with rasterio.open(path) as file:
             read.append(np.moveaxis(file.read(), 0, 2))
-        location = roadgeo.Location(paths[0], "not_located", f"hardly a road in {paths[0]}")
+        location = roadgeo.Location(path, "not_located", f"hardly a road in {path}")
         return Sighting(location, roadgeo.RoadMask(np.zeros((9, 9))))
 
     monkeypatch.setattr(queries, "locate_photograph", segmented)

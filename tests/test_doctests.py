@@ -9,7 +9,6 @@ import cv2
 import pytest
 
 import roadgeo
-from roadgeo.api import build_reference
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 
 MODULES = (
@@ -26,7 +25,7 @@ MODULES = (
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the examples speak of: the demonstration's map and masks, and frames of a short flight."""
     folder = tmp_path_factory.mktemp("desk")
-    build_reference(ROADS, "porto", path=folder / "porto.gpkg")
+    roadgeo.index(ROADS, "porto", path=folder / "porto.gpkg")
     for source in (ROADS, PHOTO, *(mask.path for mask in demo_masks())):
         (folder / source.name).write_bytes(source.read_bytes())
     roadgeo.locate(folder / "drone.png", folder / "porto.gpkg").write(folder)

@@ -103,7 +103,7 @@ def test_an_onboard_computer_locates_and_names_what_is_missing(porto: Path, tmp_
         ["locate", DRONE, "-r", porto, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
         ["locate", DRONE, "-r", porto, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
         ["vectorize", DRONE],
-        ["info", porto],
+        ["reference", "info", porto],
     ):
         done = run(*arguments)
         assert done.returncode == 0, done.stderr

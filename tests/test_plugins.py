@@ -136,7 +136,7 @@ def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
         (["index", "--source", "files:missing.gpkg"], 1, "missing.gpkg"),
         (["locate", "a.png", "--segmenter", "eyes"], 2, "got 'eyes', expected one of mask"),
         (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, kmz"),
-        (["info"], 2, "Missing argument 'REF'"),
+        (["reference", "info"], 2, "Missing argument 'REF'"),
     ],
 )
 def test_the_command_line_knows_what_is_installed(
@@ -202,9 +202,9 @@ def test_the_example_is_installed_and_used(installed: dict[str, str], tmp_path: 
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    listed = json.loads(roadgeo("info", "--plugins", "--json"))
+    listed = json.loads(roadgeo("reference", "info", "--plugins", "--json"))
     assert {entry["group"] for entry in listed if entry["package"] == "roadgeo-wkt 1.0"} == set(GROUPS)
-    assert "roadgeo.segmenters  yellow" in roadgeo("info", "--plugins")
+    assert "roadgeo.segmenters  yellow" in roadgeo("reference", "info", "--plugins")
 
     roads = read_roads(ROADS)
     degrees = [

@@ -48,11 +48,8 @@ COMMANDS = {
     "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
 }
 
-#: Commands that are not listed: those that are called once, and former names, which stay for one version.
-_UNLISTED = {
-    "completion": "roadgeo.cli.completion",
-    **dict.fromkeys(("info", "check", "list", "remove"), "roadgeo.cli.references"),
-}
+#: Commands that are not listed: those that are called once.
+_UNLISTED = {"completion": "roadgeo.cli.completion"}
 
 
 class Group(click.Group):
@@ -95,8 +92,6 @@ class LazyGroup(Group):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"Did you mean {near[0]}?" if near else ""
             raise click.UsageError(f"No such command {args[0]!r}. {hint}".strip(), ctx)
-        if args and _UNLISTED.get(args[0]) == "roadgeo.cli.references" and sys.stderr.isatty():
-            echo(f"`roadgeo {args[0]}` is called `roadgeo reference {args[0]}` now", err=True)
         ctx.meta["roadgeo.arguments"] = list(args)  # see `cli.command_line`
         return super().resolve_command(ctx, args)
 

@@ -35,7 +35,7 @@ def demo_command(out_dir: str) -> int:
       roadgeo demo
       roadgeo demo --out-dir porto
     """
-    from roadgeo.api import build_reference
+    from roadgeo.api import index
     from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.demo import (
         ATTRIBUTION,
@@ -66,7 +66,7 @@ def demo_command(out_dir: str) -> int:
         started = perf_counter()
         path = folder / f"{name}.gpkg"
         # the city's file has no kinds of roads
-        reference = build_reference(
+        reference = index(
             roads, name, path=path, kinds="all" if roads == STREETS else "drivable", attribution=attribution
         )
         seconds = perf_counter() - started

@@ -42,7 +42,6 @@ from roadgeo.outputs.registry import (
     ALWAYS,
     EXPLANATION,
     EXPLANATION_PICTURE,
-    GCPS,
     OVERLAY,
     REGISTRY,
     REPORT,
@@ -145,7 +144,6 @@ _OPTIONS = (
     row("--take", "N", RESULTS,
         "Where nothing is located: write the N-th of the places that the refusal lists, as chosen by you.",
         type=click.IntRange(1), rare=True),
-    row("--gcps", "", RESULTS, f"The same as --also gcps: {GCPS.summary}.", rare=True),
     take("crs", "resolution", "resampling", "compression"),
     row("--max-pixels", "N", RESULTS,
         "Draw coarser rather than more than this.",
@@ -228,7 +226,7 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
     from roadgeo.outputs.orthophoto import ImageOptions
 
     switched = [output.name for output in REGISTRY.values() if output.option and given[output.option[2:]]]
-    asked = [*given["products"], *([GCPS.name] if given["gcps"] else []), *switched]
+    asked = [*given["products"], *switched]
     image = ImageOptions(
         given["crs"], given["resolution"], given["resampling"], given["max_pixels"], given["compression"]
     )

@@ -72,7 +72,7 @@ class _Option(click.Option):
         self.group, self.rare, self.hint = group, rare, hint
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return names and help, without a name from before; but for --help-all the first sentence of the help only."""
+        """Return names and help; but for --help-all the first sentence of the help only."""
         record = super().get_help_record(ctx)
         if record is None:
             return None
@@ -80,7 +80,7 @@ class _Option(click.Option):
         if getattr(ctx.command, "is_long", False) and not ctx.meta.get(_WHOLE, False):
             default = re.search(r"\[default: [^\];]*", text)
             text = re.split(r"(?<=[^.]\.) ", self.help or "")[0] + (f"  {default[0]}]" if default else "")
-        return names.replace(f", {self.hint.also}", "") if self.hint and self.hint.also else names, text
+        return names, text
 
 
 class Command(click.Command):
@@ -290,7 +290,7 @@ def _hint_option(name: str, command: Decorated, **own: Any) -> Decorated:
     """Add the option of a hint."""
     hint = HINTS[name]
     shown = tuple(hint.form.split("|")) if name == "effort" else hint.form
-    names = [own.pop("called", hint.option), *([hint.also] if hint.also else []), hint.goes_to]
+    names = [own.pop("called", hint.option), hint.goes_to]
     kind = {"default": None} if shown == "" else {} if name == "effort" else {"type": Read(name, hint.read)}
     decorated: Decorated = row(" ".join(names), shown, hint.group, hint.told, hint=hint, **kind)(command, **own)
     return decorated

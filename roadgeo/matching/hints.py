@@ -40,7 +40,6 @@ class Hint:
     schema: Mapping[str, Any]  # JSON Schema of a value over HTTP, next to a text
     default: float | str = ""  # if it fits in a word; `told` adds it to the help
     group: str = "The image"  # its heading in the help
-    also: str = ""  # an earlier name of the option
 
     @property
     def option(self) -> str:
@@ -220,7 +219,6 @@ _TABLE = (
         "focal", "focal_px", "PIXELS|exif", "Focal length, pixels",
         "Focal length in pixels, or as the EXIF says. That of the photograph, if one goes with a mask.",
         _read_focal, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
-        also="--camera",
     ),
     Hint(
         "effort", "effort", "quick|full", "Effort",

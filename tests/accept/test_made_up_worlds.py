@@ -17,7 +17,7 @@ BESIDE = np.array([4000.0, 0.0])
 def known():
     """A town of 3.6 x 3.6 km, and its reference."""
     streets = town(1)
-    return streets, roadgeo.build_reference(roads_of(streets))
+    return streets, roadgeo.index(roads_of(streets))
 
 
 def miss(found, matrix, size=SIZE):
@@ -87,7 +87,7 @@ def test_ground_that_was_cut_out_of_the_map_is_refused():
     """Roads reach into the frame from two sides; its middle is not on the map."""
     streets = town(5)
     kept = [street for street in streets if not 1300.0 < street[:, 0].mean() < 2300.0]
-    reference = roadgeo.build_reference(roads_of(kept))
+    reference = roadgeo.index(roads_of(kept))
     for heading in (0.0, 100.0):
         mask = draw(streets, view((1800.0, 1800.0), (1100, 1100), heading_deg=heading), (1100, 1100))
         assert refused(roadgeo.locate(mask, reference))
@@ -103,7 +103,7 @@ class TestTwins:
         streets, other = town(6), town(7)
         around = [street + BESIDE for street in other if not self_box(street)]
         copy = [street + BESIDE for street in streets if self_box(street)]
-        return streets, roadgeo.build_reference(roads_of([*streets, *around, *copy]))
+        return streets, roadgeo.index(roads_of([*streets, *around, *copy]))
 
     def test_what_fits_both_is_ambiguous(self, twin):
         streets, reference = twin
@@ -126,7 +126,7 @@ def self_box(street):
 
 @functools.cache
 def map_of(seed, kept):
-    return roadgeo.build_reference(roads_of(lattice(seed, kept)))
+    return roadgeo.index(roads_of(lattice(seed, kept)))
 
 
 class TestLattices:

@@ -19,7 +19,7 @@ CASES = json.loads((DATA / "cases.json").read_text(encoding="utf-8"))
 
 @cache
 def reference_of(city):
-    return roadgeo.build_reference(DATA / f"{city}.parquet")
+    return roadgeo.index(DATA / f"{city}.parquet")
 
 
 def locate(case):

@@ -69,7 +69,12 @@ def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
 
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [("ver", "verify"), ("locate --gc", "--gcps"), ("locate --also geoj", "geojson"), ("index --kinds dr", "drivable")],
+    [
+        ("ver", "verify"),
+        ("locate --rep", "--report"),
+        ("locate --also geoj", "geojson"),
+        ("index --kinds dr", "drivable"),
+    ],
 )
 def test_the_shell_completes_commands_options_and_their_values(
     typed: str, offered: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

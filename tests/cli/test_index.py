@@ -38,7 +38,7 @@ def test_a_place_becomes_a_reference_in_the_library(osm, tmp_path, capsys):
     assert index("--osm", "Fenway, Boston", osm=osm) == 0
     capsys.readouterr()
     assert {file.name for file in (tmp_path / "library").iterdir()} == {"fenway-boston.gpkg", "fenway-boston.index"}
-    assert main(["info", "fenway-boston", "--json"]) == 0
+    assert main(["reference", "info", "fenway-boston", "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
     assert "OpenStreetMap contributors" in json.dumps(output, ensure_ascii=False)
     assert "2022-05-04T19:30:42Z" in json.dumps(output)
@@ -75,16 +75,16 @@ def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
 def test_a_reference_is_called_after_its_own_file(tmp_path, capsys, given, name):
     assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0
     (reference,) = tmp_path.glob("*.index")
-    assert main(["info", str(reference)]) == 0
+    assert main(["reference", "info", str(reference)]) == 0
     assert capsys.readouterr().out.splitlines()[0].split() == ["name", name]
-    assert main(["info", str(reference), "--json"]) == 0
+    assert main(["reference", "info", str(reference), "--json"]) == 0
     assert "a.geojson" in json.dumps(json.loads(capsys.readouterr().out)["meta"]["sources"])
 
 
 def counts(reference, capsys):
     capsys.readouterr()
-    assert main(["check", str(reference)]) == 0
-    assert main(["info", str(reference), "--json"]) == 0
+    assert main(["reference", "check", str(reference)]) == 0
+    assert main(["reference", "info", str(reference), "--json"]) == 0
     output = json.loads(capsys.readouterr().out.partition("\n")[2])
     return output["counts"]["intersections"], output["road_km"], output["meta"]
 

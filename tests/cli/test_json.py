@@ -61,10 +61,10 @@ def test_the_command_of_a_result_makes_it_again(porto: Path, capfd: pytest.Captu
 def test_references_and_plugins_are_told_by_schema(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     Path("porto.gpkg").write_bytes(porto.read_bytes())  # without an index: less is known
     for command, schema in (
-        (["info", str(porto), "--json"], "info"),
-        (["info", "porto.gpkg", "--json"], "info"),
-        (["list", "--json"], "info"),
-        (["info", "--plugins", "--json"], "plugins"),
+        (["reference", "info", str(porto), "--json"], "info"),
+        (["reference", "info", "porto.gpkg", "--json"], "info"),
+        (["reference", "list", "--json"], "info"),
+        (["reference", "info", "--plugins", "--json"], "plugins"),
     ):
         assert main(command) == 0
         document = json.loads(capfd.readouterr().out)

@@ -143,7 +143,7 @@ def test_the_photograph_is_drawn_in_the_crs_asked_for(
     Path("photos").mkdir()
     photo = cv2.cvtColor(cv2.resize(cv2.imread("drone_mask.png", 0), None, fx=2, fy=2), cv2.COLOR_GRAY2BGR)
     cv2.imwrite("photos/drone.png", photo)
-    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--gcps", "--also", "geojson", "-r", str(porto)]
+    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--also", "gcps", "--also", "geojson", "-r", str(porto)]
     assert main(["locate", "drone_mask.png", "--image", "photos", *arguments]) == 0
     assert f"drew {Path('photos', 'drone.png')}, 2 times the mask's size" in capfd.readouterr().out
     with rasterio.open("drone_mask_footprint.tif") as raster:
@@ -207,14 +207,14 @@ def test_the_papers_matcher_says_once_what_it_found(porto: Path, capfd: pytest.C
 
 def test_the_library_is_searched_by_default(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["index", "--roads", str(ROADS), "--name", "Porto, Portugal", "-q"]) == 0
-    assert main(["list"]) == 0
+    assert main(["reference", "list"]) == 0
     assert "porto-portugal" in capfd.readouterr().out
     assert main(["locate", str(MASKS["high_flight"].path)]) == 0
     assert "on porto-portugal" in capfd.readouterr().out
-    assert main(["info", "porto-portugal"]) == 0
+    assert main(["reference", "info", "porto-portugal"]) == 0
     assert "intersections" in capfd.readouterr().out
-    assert main(["check", "porto-portugal"]) == 0
-    assert main(["remove", "porto-portugal", "--yes"]) == 0
+    assert main(["reference", "check", "porto-portugal"]) == 0
+    assert main(["reference", "remove", "porto-portugal", "--yes"]) == 0
     capfd.readouterr()
     assert main(["locate", str(MASKS["high_flight"].path)]) == 1
     assert "is empty and no --reference was given" in capfd.readouterr().err
@@ -397,7 +397,7 @@ def test_the_json_says_how_it_was_made(porto: Path, capfd: pytest.CaptureFixture
     found = json.loads(capfd.readouterr().out)
     assert found["version"] == __version__
     assert found["options"] == {"match": {"camera": {"max_tilt_deg": 50.0}}, "threshold": 99.0}
-    assert main(["info", str(porto), "--json"]) == 0
+    assert main(["reference", "info", str(porto), "--json"]) == 0
     assert found["reference_digest"] == reference_digest(porto)
     assert 0 < found["rmse_m"] < 3
     assert found["rmse_px"] == pytest.approx(found["rmse_m"] / found["gsd_m"], rel=0.5)

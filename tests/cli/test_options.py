@@ -136,9 +136,3 @@ def test_what_is_rarely_wanted_is_explained_by_all_of_the_help() -> None:
     whole = " ".join(shown("locate", "--help-all").split())
     assert "share of the map's shards" in whole
     assert "worldfile" in whole
-
-
-@pytest.mark.parametrize("name", ["info", "check", "list", "remove"])
-def test_earlier_names_are_the_same_commands(name: str) -> None:
-    assert name not in COMMANDS
-    assert command(name) is command("reference").commands[name]

@@ -65,9 +65,9 @@ def test_names_of_references_do_not_speak_to_the_terminal(
     with sqlite3.connect(tmp_path / f"{ESCAPES}.gpkg") as database:
         reported = (json.dumps(f"{ESCAPES}\nOpenStreetMap"), "attribution")
         database.execute("UPDATE roadgeo_meta SET value = ? WHERE key = ?", reported)
-    assert main(["list"]) == 0
-    assert main(["info", str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
-    main(["check", str(tmp_path / f"{ESCAPES}.gpkg")])
+    assert main(["reference", "list"]) == 0
+    assert main(["reference", "info", str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
+    main(["reference", "check", str(tmp_path / f"{ESCAPES}.gpkg")])
     assert main(["locate", "missing.png", "-r", f"no{ESCAPES}"]) == 1
     said = "".join(capfd.readouterr())
     assert not [item for item in FORBIDDEN if item in said]

@@ -23,7 +23,7 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_what_is_damaged_is_said_and_the_rest_is_listed(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list", "--json"]) == 1
+    assert main(["reference", "list", "--json"]) == 1
     output = capsys.readouterr()
     assert [json.loads(line)["name"] for line in output.out.splitlines()] == ["good"]
     assert output.err.startswith(f"Error: {library / 'bad.gpkg'}")
@@ -31,7 +31,7 @@ def test_what_is_damaged_is_said_and_the_rest_is_listed(library: Path, capsys: p
 
 
 def test_every_reference_is_checked(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "bad", "nonesuch", "good"]) == 1
+    assert main(["reference", "check", "bad", "nonesuch", "good"]) == 1
     output = capsys.readouterr()
     assert output.out == "good: sound\n"
     first, *_, last = output.err.splitlines()
@@ -52,7 +52,7 @@ def test_before_one_is_removed_it_is_asked(
             raise EOFError from None
 
     monkeypatch.setattr("click.termui.visible_prompt_func", answer)
-    assert main(["remove", "good"]) == (0 if typed == "y\n" else 130)
+    assert main(["reference", "remove", "good"]) == (0 if typed == "y\n" else 130)
     assert sorted(path.stem for path in library.glob("*.gpkg")) == left
 
 
@@ -60,7 +60,7 @@ def test_an_empty_library_says_how_it_is_filled(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
-    assert main(["list"]) == 0
+    assert main(["reference", "list"]) == 0
     assert capsys.readouterr() == ("", f"The library in {tmp_path} is empty; `roadgeo index` adds to it.\n")
 
 
@@ -81,7 +81,7 @@ def test_kinds_that_no_column_tells_are_not_claimed(
         capsys.readouterr()
         assert caplog.text.count("bare.gpkg: no column tells what kind of road a line is") == 1
         caplog.clear()
-        assert main(["info", str(tmp_path / "ref.gpkg")]) == 0
+        assert main(["reference", "info", str(tmp_path / "ref.gpkg")]) == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("kinds")]
         assert reported in line
 

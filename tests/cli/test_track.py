@@ -46,7 +46,7 @@ def test_a_flight_is_followed_and_written(flown, tmp_path, capfd):
     folder, flight, plane = flown
     command = ["track", str(folder / "frames"), "-r", str(folder / "town.gpkg"), "--motion", str(folder / "motion.csv")]
     focal = str(flight.views[0].focal_px)
-    given = ["-o", str(tmp_path), "--start", "2024-05-01T09:30:00", "--json", "--camera", focal]
+    given = ["-o", str(tmp_path), "--start", "2024-05-01T09:30:00", "--json", "--focal", focal]
     assert main([*command, *given]) == 0
     output = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     for entry in output:
@@ -82,7 +82,7 @@ def test_an_autopilot_hears_what_is_printed(flown, tmp_path, capfd):
     command = ["track", str(folder / "frames"), "-r", str(folder / "town.gpkg"), "--motion", str(folder / "motion.csv")]
     began = time.time() - 60.0
     start = datetime.fromtimestamp(began, UTC).isoformat()
-    given = ["-o", str(tmp_path), "--json", "-q", "--camera", str(flight.views[0].focal_px), "--start", start]
+    given = ["-o", str(tmp_path), "--json", "-q", "--focal", str(flight.views[0].focal_px), "--start", start]
     with listening() as (url, heard):
         assert main([*command, *given, "--mavlink", url]) == 0
     rows = [json.loads(line) for line in capfd.readouterr().out.splitlines()]

@@ -18,7 +18,7 @@ import sys
 import roadgeo
 
 from roadgeo.evaluation.demo import ROADS, demo_masks
-reference = roadgeo.build_reference(ROADS, "porto")
+reference = roadgeo.index(ROADS, "porto")
 assert roadgeo.locate(demo_masks()[0].path, reference).status == "located"
 assert "numba" not in sys.modules
 """

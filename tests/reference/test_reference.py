@@ -7,7 +7,7 @@ import geopandas
 import pytest
 from worlds.fenway import streets
 
-from roadgeo.api import build_reference
+import roadgeo
 from roadgeo.errors import IndexFormatError
 from roadgeo.matching.index import IndexOptions
 from roadgeo.reference.network_file import read_network
@@ -25,7 +25,7 @@ OPTIONS = BuildOptions(
 @pytest.fixture(scope="module")
 def built():
     roads = geopandas.GeoDataFrame(geometry=streets()[0], crs="EPSG:4326")
-    return build_reference(roads, "fenway", OPTIONS)
+    return roadgeo.index(roads, "fenway", OPTIONS)
 
 
 def test_an_index_is_built_again_as_it_was(built, tmp_path):

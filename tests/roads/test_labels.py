@@ -10,7 +10,6 @@ import numpy as np
 import shapely
 
 import roadgeo
-from roadgeo.api import build_reference
 from roadgeo.reference.network_file import _texts, read_network
 from roadgeo.sources.roads import read_roads
 
@@ -33,7 +32,7 @@ def roads_of(path: Path) -> list[tuple]:
 
 
 def test_roads_keep_names_and_kinds(tmp_path: Path) -> None:
-    build_reference(streets(), path=tmp_path / "a.gpkg")
+    roadgeo.index(streets(), path=tmp_path / "a.gpkg")
     roads = roads_of(tmp_path / "a.gpkg")
     assert len(roads) == 56
     for name, kind, (x, y) in roads:
@@ -67,7 +66,7 @@ def test_files_and_cut_files_keep_them_too(tmp_path: Path) -> None:
 
 
 def test_references_without_names_are_as_before(tmp_path: Path) -> None:
-    build_reference(streets()[["geometry"]], path=tmp_path / "a.gpkg")
+    roadgeo.index(streets()[["geometry"]], path=tmp_path / "a.gpkg")
     network = read_network(tmp_path / "a.gpkg")
     assert network.names is None
     assert roadgeo.open_reference(tmp_path / "a.gpkg").index is not None

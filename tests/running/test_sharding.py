@@ -11,7 +11,7 @@ import shapely
 from worlds.fenway import write_vector
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
-from roadgeo.api import build_reference
+import roadgeo
 from roadgeo.cli import main
 from roadgeo.errors import CrsError, IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import transformer
@@ -50,7 +50,7 @@ def write_vector_crs(path, lines):
 
 @pytest.fixture(scope="module")
 def whole(roads):
-    return build_reference(roads, "town")
+    return roadgeo.index(roads, "town")
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_main_roads_make_a_coarse_map_beside_the_shards(region):
 
 
 def test_the_coarse_map_is_told_of(region, capsys):
-    assert main(["info", str(region.path)]) == 0
+    assert main(["reference", "info", str(region.path)]) == 0
     assert f"and a coarse map of {region.manifest.coarse.intersections:,}" in capsys.readouterr().out
 
 
@@ -333,14 +333,14 @@ def test_the_command_line_builds_describes_lists_and_removes(roads, tmp_path, mo
     (tmp_path / "library").mkdir()
     assert main(["index", "--roads", str(roads), "--shards", "2km", "--margin", "500", "--name", "Town"]) == 0
     assert "shards in" in capsys.readouterr().out
-    assert main(["info", "town"]) == 0
+    assert main(["reference", "info", "town"]) == 0
     assert "with margins of 0.5 km" in capsys.readouterr().out
-    assert main(["info", "town", "--json"]) == 0
+    assert main(["reference", "info", "town", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["shards"]["count"] >= 3
-    assert main(["check", "town"]) == 0
-    assert main(["list"]) == 0
+    assert main(["reference", "check", "town"]) == 0
+    assert main(["reference", "list"]) == 0
     assert "town" in capsys.readouterr().out
-    assert main(["remove", "town", "--yes"]) == 0
+    assert main(["reference", "remove", "town", "--yes"]) == 0
     assert not list((tmp_path / "library").iterdir())
 
 

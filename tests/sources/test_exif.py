@@ -35,6 +35,6 @@ def test_a_missing_file_is_named(tmp_path):
 
 @pytest.mark.parametrize("wrong", ["wide", "-3", "0", "nan"])
 def test_what_is_no_focal_length_is_a_usage_error(wrong):
-    result = CliRunner().invoke(cli, ["locate", "mask.png", "--camera", wrong])
+    result = CliRunner().invoke(cli, ["locate", "mask.png", "--focal", wrong])
     assert result.exit_code == 2
     assert "expected pixels above 0, or exif" in result.output

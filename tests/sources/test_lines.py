@@ -360,11 +360,11 @@ def test_text_that_is_not_in_the_encoding_that_a_file_names(tmp_path, suffix):
 
 
 def test_results_in_a_folder_are_no_roads(tmp_path, caplog):
-    from roadgeo.api import build_reference
+    import roadgeo
     from roadgeo.sources.roads import read_roads
 
     write_streets(tmp_path / "streets.gpkg")
-    build_reference(tmp_path / "streets.gpkg", path=tmp_path / "city.gpkg")
+    roadgeo.index(tmp_path / "streets.gpkg", path=tmp_path / "city.gpkg")
     write_vector(tmp_path / "a_location.gpkg", streets()[0], layer="query_roads")
     assert list_sources(tmp_path) == [tmp_path / "streets.gpkg"]
     assert "city.gpkg: passed over: a result or a reference of roadgeo" in caplog.text

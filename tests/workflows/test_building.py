@@ -8,7 +8,6 @@ import shapely
 from worlds.fenway import streets
 
 import roadgeo
-from roadgeo.api import build_reference
 from roadgeo.cli import main
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.reference.reference import open_reference
@@ -31,14 +30,14 @@ def test_a_table_is_filtered_as_the_command_filters_a_file(roads, tmp_path, monk
     assert main(["index", "--roads", "mixed.gpkg", "--out", "cli.gpkg", "-q"]) == 0
     by_command = open_reference("cli.gpkg").index
     for given in (mixed, "mixed.gpkg"):
-        by_call = build_reference(given, "cli", path="api.gpkg").index
+        by_call = roadgeo.index(given, "cli", path="api.gpkg").index
         np.testing.assert_array_equal(by_call.xy, by_command.xy)
         np.testing.assert_array_equal(by_call.table_entries, by_command.table_entries)
-    assert len(build_reference(mixed, kinds="all").index) > len(by_command)
+    assert len(roadgeo.index(mixed, kinds="all").index) > len(by_command)
 
 
 def test_whom_to_name_is_kept(roads, tmp_path):
-    built = build_reference(roads, "fenway", path=tmp_path / "fenway.gpkg", attribution="© somebody")
+    built = roadgeo.index(roads, "fenway", path=tmp_path / "fenway.gpkg", attribution="© somebody")
     assert built.index.meta["attribution"] == "© somebody"
     assert open_reference(tmp_path / "fenway.gpkg").name == "fenway"
 
@@ -78,8 +77,8 @@ def held(kind, roads):
 def test_roads_are_taken_however_they_are_held(kind, roads):
     drivable = roads[roads.highway.isin(["residential", "primary", "secondary", "tertiary"]) & roads.tunnel.isna()]
     given, more = held(kind, drivable)
-    expected = roadgeo.build_reference(drivable, "fenway", kinds="all")
-    found = roadgeo.build_reference(given, "fenway", kinds="all", **more)
+    expected = roadgeo.index(drivable, "fenway", kinds="all")
+    found = roadgeo.index(given, "fenway", kinds="all", **more)
     np.testing.assert_allclose(found.index.xy, expected.index.xy, atol=1e-6)
 
 
@@ -94,9 +93,9 @@ def test_roads_are_taken_however_they_are_held(kind, roads):
 )
 def test_what_holds_no_roads_is_named(given, error, match):
     with pytest.raises(error, match=match):
-        roadgeo.build_reference(given)
+        roadgeo.index(given)
 
 
 def test_a_crs_that_is_none_is_named():
     with pytest.raises(CrsError, match="'here' is no CRS"):
-        roadgeo.build_reference([np.zeros((2, 2))], crs="here")
+        roadgeo.index([np.zeros((2, 2))], crs="here")

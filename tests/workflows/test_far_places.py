@@ -61,10 +61,10 @@ def test_from_road_lines_to_every_output(
     monkeypatch.chdir(tmp_path)
     roads = write_vector(tmp_path / "roads.gpkg", [line for town in towns for line in made_up_town(*town)])
     assert main(["index", "--roads", str(roads), "-o", "map.gpkg", "-q"]) == 0
-    assert main(["check", "map.gpkg"]) == 0
+    assert main(["reference", "check", "map.gpkg"]) == 0
     assert validate(tmp_path / "map.gpkg") == ""
     capsys.readouterr()
-    assert main(["info", "map.gpkg"]) == 0
+    assert main(["reference", "info", "map.gpkg"]) == 0
     assert re.search(r"^CRS +(.*)$", capsys.readouterr().out, re.MULTILINE)[1] == crs
 
     draw = ["--noise", "clean", "--size", "800", "--gsd", "0.9:1.1", "--intersections", "15:1000", "-n", "3", "-q"]

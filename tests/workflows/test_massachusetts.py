@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from roadgeo.api import build_reference
+import roadgeo
 from roadgeo.evaluation.truth import Truth, read_truth
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pinhole import warp_mask
@@ -24,7 +24,7 @@ VIEWS = 2  # of each mask that lies on the map; of the others one
 
 @pytest.fixture(scope="module")
 def boston(data_dir) -> Reference:
-    return build_reference(gpd.read_file(data_dir / "boston" / "boston_osm_roads.gpkg"), "boston")
+    return roadgeo.index(gpd.read_file(data_dir / "boston" / "boston_osm_roads.gpkg"), "boston")
 
 
 def views(truth: Truth, mask: np.ndarray, count: int):

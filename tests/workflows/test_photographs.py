@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadgeo.api import build_reference
+import roadgeo
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
@@ -32,7 +32,7 @@ def rows(data_dir: Path) -> list[dict[str, str]]:
 def maps(data_dir: Path, rows: list[dict[str, str]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reference]:
     folder = tmp_path_factory.mktemp("maps")
     files = dict.fromkeys(row["roads"] for row in rows)
-    return {file: build_reference(data_dir / file, path=folder / f"{Path(file).stem}.gpkg") for file in files}
+    return {file: roadgeo.index(data_dir / file, path=folder / f"{Path(file).stem}.gpkg") for file in files}
 
 
 def told(row: dict[str, str], what: str) -> LocateOptions:
