@@ -14,7 +14,7 @@ from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation, tell
 from roadgeo.matching.index import build_index
-from roadgeo.matching.methods import Found, search_references
+from roadgeo.matching.methods import Searched, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
@@ -113,7 +113,7 @@ def _search(
     reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None,
     explained: bool = False,
-) -> tuple[Query, list[Found], LocateOptions]:
+) -> tuple[Query, list[Searched], LocateOptions]:
     """Trace a mask, and search all references together for it, within the time that tracing left."""
     options = options or LocateOptions()
     references = list(reference) if isinstance(reference, Sequence) else [reference]

@@ -17,10 +17,10 @@ from roadgeo._arrays import FloatArray
 from roadgeo.flights.mosaic import Mosaic
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.location import Location
-from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.methods import Found, Known, search_references
+from roadgeo.matching.methods import Proposed, Searched, search_references
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import Reference
@@ -107,22 +107,26 @@ class Candidates:
         """Search the map where that is due; places that were proposed before are among those that the search meets."""
         if not look.searched:
             options = replace(options, match=replace(options.match, sweeps=(), without_roads=(), roads=False))
-        known: list[Known] = [(kept.index, kept.under(look)) for kept in self._kept if kept.seen_at in look.numbers]
+        proposed: list[Proposed] = [
+            (kept.index, kept.under(look)) for kept in self._kept if kept.seen_at in look.numbers
+        ]
         parts = [part for reference in self.references for part in reference.parts]
-        found = search_references(look.query, parts, options, options.search.time_limit_s, explained=True, known=known)
+        found = search_references(
+            look.query, parts, options, options.search.time_limit_s, explained=True, proposed=proposed
+        )
         kept = [candidate for result in found for candidate in _proposed(result, look)]
         self._kept = sorted(kept, key=lambda kept: -kept.log10_likelihood)[:MOST]
         paid = math.log10(max(self.n_looks, 1))  # each search may find a place by chance
         return decide(look.query, [result.less_likely(paid) for result in found], options)
 
 
-def _proposed(found: Found, look: Look) -> Iterable[_Candidate]:
+def _proposed(searched: Searched, look: Look) -> Iterable[_Candidate]:
     """Yield the likeliest places that a search compared with the map."""
-    estimator, best = found.events.estimator, list[Hypothesis]()
-    if estimator is None:
+    best: list[Place] = []
+    if searched.estimator is None:
         return
-    for model in sorted(estimator.verified, key=lambda model: -model.log10_likelihood):
-        if len(best) < MOST and not any(estimator.same(model, known) for known in best):
-            best.append(model)
-            matrix = model.matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
-            yield _Candidate(found.index, matrix, look.numbers[-1], model.log10_likelihood)
+    for place in sorted(searched.estimator.verified, key=lambda place: -place.log10_likelihood):
+        if len(best) < MOST and not any(place.same(known) for known in best):
+            best.append(place)
+            matrix = place.matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
+            yield _Candidate(searched.index, matrix, look.numbers[-1], place.log10_likelihood)

@@ -9,14 +9,13 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import road_residuals
-from roadgeo.matching.evidence import Evidence, agreement, match_intersections
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture
-from roadgeo.matching.refinement import Refined, RefineOptions, points_on_map, refine, refine_between
+from roadgeo.matching.place import Place, Weight
+from roadgeo.matching.refinement import RefineOptions, points_on_map, refine, refine_between
 from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.shifts import APART_M, LocalSearchOptions, move_about, search_nearby
 
@@ -96,134 +95,122 @@ def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options:
     start : (3, 3) float64
         Query plane to reference plane, as it is given.
     """
-    options = options or CheckOptions()
-    gsd = sampling(start, scene.size)
-    if scene.road_length_px * gsd < _MIN_ROADS_M:
-        return Checked("unknown", f"too few roads: the mask shows {scene.road_length_px * gsd:.0f} m of them")
-    judge = _Judge(scene, index, start, options)
+    judge = _Judge(Place(scene, index, start), options or CheckOptions())
+    shown_m = scene.road_length_px * judge.given.gsd_m
+    if shown_m < _MIN_ROADS_M:
+        return Checked("unknown", f"too few roads: the mask shows {shown_m:.0f} m of them")
     if judge.map_length_m < _MIN_ROADS_M:
         return Checked("unknown", f"the map has {judge.map_length_m:.0f} m of roads there: not on this map")
-    return _judge_best(judge, judge.refine_all([start, *judge.propose()]))
-
-
-@dataclass(frozen=True)
-class _Place:
-    """A place, its evidence (log10), and its refinement, where that was possible."""
-
-    matrix: FloatArray
-    worth: float
-    matched: IntArray
-    refined: Refined | None
+    return _judge_best(judge, judge.refine_all([judge.given, *judge.propose()]))
 
 
 class _Judge:
-    """Refines places of one scene and measures their agreement."""
+    """Refines places of one scene and measures their agreement; `given` is the place to be checked."""
 
-    def __init__(self, scene: Scene, index: ReferenceIndex, start: FloatArray, options: CheckOptions) -> None:
-        self.scene, self.index, self.start, self.options = scene, index, start, options
-        self.gsd = sampling(start, scene.size)
+    def __init__(self, given: Place, options: CheckOptions) -> None:
+        self.given, self.options = given, options
+        scene, index, start = given.scene, given.index, given.matrix
         self.corners = Homography(start)(scene.corners)
-        self.evidence = Evidence(scene, index, self.gsd)
-        self.picture = Picture(scene, index, self.gsd) if scene.probability is not None else None
+        self.picture = Picture(scene, index, given.gsd_m) if scene.probability is not None else None
         tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
         self.refine_options = RefineOptions() if tilted else RefineOptions(perspective_sigma=_PERSPECTIVE_SIGMA)
 
     @property
     def map_length_m(self) -> float:
         """Length of the map's roads inside the frame as it is given, metres."""
-        return self.gsd * self.evidence.mapped_px(self.start)
+        return self.given.gsd_m * self.given.evidence.mapped_px(self.given.matrix)
 
-    def propose(self) -> list[FloatArray]:
+    def propose(self) -> list[Place]:
         """Return the starts of the places nearby."""
-        center = Homography(self.start)(self.scene.center)
-        shifts = search_nearby(self.start, self.scene, self.index, self.options.search)
-        return [move_about(center, shift) @ self.start for shift in shifts]
+        given = self.given
+        center = Homography(given.matrix)(given.scene.center)
+        shifts = search_nearby(given.matrix, given.scene, given.index, self.options.search)
+        return [Place(given.scene, given.index, move_about(center, shift) @ given.matrix) for shift in shifts]
 
-    def refine_all(self, starts: Sequence[FloatArray]) -> list[_Place]:
+    def refine_all(self, starts: Sequence[Place]) -> list[Place]:
         """Refine places roughly; return the distinct ones, by falling agreement."""
         places = [self.refine(start, 200) for start in starts]
-        distinct: list[_Place] = []
-        for place in sorted(places, key=lambda place: -place.worth):
-            if all(self.gap(place.matrix, other.matrix) >= APART_M for other in distinct):
+        distinct: list[Place] = []
+        for place in sorted(places, key=lambda place: -place.log10_likelihood):
+            if all(self.gap(place, other) >= APART_M for other in distinct):
                 distinct.append(place)
         return distinct
 
-    def refine(self, start: FloatArray, n_points: int | None) -> _Place:
+    def refine(self, start: Place, n_points: int | None) -> Place:
         """Refine a place until its matches settle; keep it unchanged if the refinement diverges."""
-        matrix, refined = start, None
-        scene = self.scene if n_points else self.without_twins(start)
-        matched = np.full(len(self.scene.intersections), -1)
+        place = start
+        scene = start.scene if n_points else self.without_twins(start)
+        matched = np.full(len(scene.intersections), -1)
         for _ in range(3):
-            matched, _ = match_intersections(matrix, self.scene, self.index)
-            step = refine(matrix, scene, self.index, matched, self.refine_options, n_points, held=True)
-            if step is None or not self.gap(step.matrix, start) < _MAX_DRIFT_M:
+            matched, _ = place.matches
+            step = refine(place.matrix, scene, place.index, matched, self.refine_options, n_points, held=True)
+            moved = None if step is None else place.at(step)
+            if moved is None or not self.gap(moved, start) < _MAX_DRIFT_M:
                 break
-            refined, matrix = step, step.matrix
-        if refined is not None and n_points is None:
-            refined, _ = refine_between(refined, scene, self.index, matched, self.refine_options)
-            matrix = refined.matrix
-        return _Place(matrix, self.weigh(matrix), matched, refined)
+            place = moved
+        if place.refined is not None and n_points is None:
+            place = place.at(refine_between(place.refined, scene, place.index, matched, self.refine_options)[0])
+        return place.but(by=self.weigh(place.matrix))
 
-    def weigh(self, matrix: FloatArray) -> float:
-        """Return log10 L of a place: by a soft picture, or by the roads of a drawn mask."""
-        return (self.picture or self.evidence).weigh(matrix)
+    def weigh(self, matrix: FloatArray) -> Weight:
+        """Return the likelihood of a place: by a soft picture, or by the roads of a drawn mask."""
+        yardstick = self.picture or self.given.evidence
+        return Weight(yardstick.weigh(matrix), yardstick.statement_px)
 
-    def lead(self, best: _Place, places: Sequence[_Place]) -> tuple[float, _Place | None]:
+    def lead(self, best: Place, places: Sequence[Place]) -> tuple[float, Place | None]:
         """Return the log10 lead of a place over its strongest rival, and the rival.
 
         A soft picture is compared with all shifts as well, for it shows more than the roads that were traced in it.
         """
-        rivals = [place for place in places if self.gap(place.matrix, best.matrix) >= APART_M]
+        rivals = [place for place in places if self.gap(place, best) >= APART_M]
         if self.picture is None:
-            compare = self.evidence.compared_with(best.matrix)
+            compare = self.given.evidence.compared_with(best.matrix)
             leads = [compare(rival.matrix)[1] for rival in rivals]
             return min(zip(leads, rivals, strict=True), key=lambda pair: pair[0], default=(0.0, None))
         peaks = self.picture.correlate(best.matrix, self.options.search.reach_m, (0.0,), _N_SHIFTS, APART_M)
-        for peak in peaks:
-            if self.gap(peak.matrix, best.matrix) >= APART_M:
-                place = self.picture.settle(peak)
-                rivals.append(_Place(place.matrix, place.worth, best.matched, None))
-        hardest = max(rivals, key=lambda rival: rival.worth, default=None)
-        return self.picture.lead(best.worth, 0.0 if hardest is None else hardest.worth), hardest
+        rivals += map(self.picture.settle, peaks)
+        hardest = max(rivals, key=lambda rival: rival.log10_likelihood, default=None)
+        likelihood = 0.0 if hardest is None else hardest.log10_likelihood
+        return self.picture.lead(best.log10_likelihood, likelihood), hardest
 
-    def without_twins(self, matrix: FloatArray) -> Scene:
+    def without_twins(self, place: Place) -> Scene:
         """Return the scene without road points that have parallel roads of the map on both sides.
 
         A mask often shows a dual carriageway as a single line, halfway between the two lines of the map. A fit to
         either line would be off by half their distance.
         """
-        scene = self.scene
-        points, along, _ = points_on_map(matrix, scene)
-        alone, found = np.zeros(len(points), bool), np.empty((len(points), 3))
+        scene, buckets = place.scene, place.index.road_buckets
+        points, along, _ = points_on_map(place.matrix, scene)
+        alone, away = np.zeros(len(points), bool), np.empty((len(points), 3))
         for across in (along[:, ::-1] * (1.0, -1.0), along[:, ::-1] * (-1.0, 1.0)):
             reach, shifted = np.full(len(points), 0.8 * _TWIN_M), np.ascontiguousarray(points + _TWIN_M * across)
-            road_residuals(np.eye(3), shifted, along, reach, MIN_COS, self.index.road_buckets, found)
-            alone |= np.isnan(found[:, 0])
+            road_residuals(np.eye(3), shifted, along, reach, MIN_COS, buckets, away)
+            alone |= np.isnan(away[:, 0])
         if alone.mean() < 0.4:
             return scene
         return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())
 
-    def agreeing(self, matrix: FloatArray) -> float:
-        """Return the share of the roads of mask and map that agree."""
-        found, _, _ = agreement(matrix, self.scene, self.index)
-        return (found.forward + found.backward) / 2.0
-
-    def displacement(self, place: _Place) -> Displacement:
+    def displacement(self, place: Place) -> Displacement:
         """Return how far a place lies from the given one."""
         covariance = np.eye(8) if place.refined is None else place.refined.corner_covariance_m2
-        return measure(self.corners, Homography(place.matrix)(self.scene.corners), covariance)
+        return measure(self.corners, Homography(place.matrix)(place.scene.corners), covariance)
 
-    def gap(self, a: FloatArray, b: FloatArray) -> float:
-        """Return the root mean square distance, metres, between the frame's corners under two homographies."""
-        gaps = Homography(a)(self.scene.corners) - Homography(b)(self.scene.corners)
+    def gap(self, a: Place, b: Place) -> float:
+        """Return the root mean square distance, metres, between the frame's corners at two places."""
+        gaps = Homography(a.matrix)(a.scene.corners) - Homography(b.matrix)(b.scene.corners)
         return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
 
 
-def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
+def _agreeing(place: Place) -> float:
+    """Return the share of the roads of mask and map that agree."""
+    return (place.agreement.forward + place.agreement.backward) / 2.0
+
+
+def _judge_best(judge: _Judge, places: Sequence[Place]) -> Checked:
     """Judge the best of some places, the best first, against the others."""
     # The best place against its strongest rival.
     options = judge.options
-    best = judge.refine(places[0].matrix, None)
+    best = judge.refine(places[0], None)
     lead, hardest = judge.lead(best, places[1:])
     if best.refined is None or hardest is None:
         return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")
@@ -235,8 +222,8 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         best.matrix,
         lead,
         judge.displacement(hardest),
-        judge.agreeing(best.matrix),
-        judge.agreeing(judge.start),
+        _agreeing(best),
+        _agreeing(judge.given),
         best.matched,
     )
     # Consequences of the distance from the claimed place.

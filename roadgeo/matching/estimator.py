@@ -12,15 +12,14 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.areas import Box, lies_in
-from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, judge
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.events import Events, Ledger, Scored
-from roadgeo.matching.evidence import Evidence, statement_px
-from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
+from roadgeo.matching.events import Events, Ledger
+from roadgeo.matching.growing import SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
-from roadgeo.matching.picture import Picture
+from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadSearch
 from roadgeo.matching.scene import AGREE_DEG, Scene
@@ -102,14 +101,14 @@ class TripleEstimator:
         self.near = near
         self.ledger = ledger or Ledger()
         self.events = events or Events()
-        if self.events.kept:
-            self.events.estimator = self
         self.refine_s = 0.0
         self.n_nulls = 0
-        self.known: list[Hypothesis] | None = None  # places that are verified first; None where none are known
-        self.verified: list[Hypothesis] = []
-        self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
-        self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
+        self.proposed: list[Place] | None = None  # places that are verified first; None where there are none
+        self.verified: list[Place] = []
+        self._settled: dict[Place, Place] = {}  # what became of each place that was to be verified
+        self._nearby: dict[Place, float] = {}
+        self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
+        self._whole: list[Place] = []  # verified, and no better version of them is to be expected
         self.scene = scene
         self.index, self.whole = index, whole or index
         self.options = options or MatchOptions()
@@ -121,23 +120,23 @@ class TripleEstimator:
         self.sweeps.members.append(self)
 
     @cached_property
-    def anywhere(self) -> TripleEstimator | None:
+    def unrestricted(self) -> TripleEstimator | None:
         """The same on the whole map, whatever the hints on the place and the heading; None without these."""
         camera = replace(self.options.camera, heading_deg=None, north_up=False)
         if self.near is None and self.options.within is None and camera == self.options.camera:
             return None
         return TripleEstimator(self.scene, self.whole, replace(self.options, camera=camera, within=None))
 
-    def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
-        """Yield the places that are known, then hypotheses that grew from each anchor; triples propose before roads.
+    def stages(self) -> Iterator[Iterator[list[Place]]]:
+        """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, source) for source in sources]
-        if self.known is not None:
-            yield iter([self.known])
+        if self.proposed is not None:
+            yield iter([self.proposed])
         if not by_roads:
             yield from sweeps
             return
@@ -161,9 +160,9 @@ class TripleEstimator:
         self.n_screened += n_places
         self.ledger.n_tried += n_places
 
-    def _rounds_of_roads(self) -> Iterator[list[Hypothesis]]:
-        """Yield places that grew by roads and are not known yet."""
-        known: list[Hypothesis] = []
+    def _rounds_of_roads(self) -> Iterator[list[Place]]:
+        """Yield places that grew by roads and were not met before."""
+        met: list[Place] = []
         options, turnout = self.options, self.sweeps.turnout(self.index.coarseness)
         roads = RoadSearch(self.scene, self.index, options.camera, self.near, self.sweeps.ahead, turnout)
         for anchor, n_tried, n_proposed, grown in roads.rounds():
@@ -171,14 +170,13 @@ class TripleEstimator:
             self.n_hypotheses += n_proposed
             self._look_for(anchor)
             self.events.note("voted", anchor, n_proposed)
-            fresh: list[Hypothesis] = []
+            fresh: list[Place] = []
             for place in grown:
-                hypothesis = Hypothesis.at(place.matrix, self.scene, self.index, place.closeness)
-                is_known = any(self._is_found_again(other, hypothesis) for other in known)
-                if not is_known and not any(self.same(other, hypothesis) for other in fresh):
-                    fresh += [hypothesis] * self._is_plausible(hypothesis)
-            known += fresh
-            self.events.note("grown", [hypothesis.matrix for hypothesis in fresh])
+                is_met = any(self._is_met_again(other, place) for other in met)
+                if not is_met and not any(other.same(place) for other in fresh) and self._is_plausible(place):
+                    fresh.append(place)
+            met += fresh
+            self.events.note("grown", [place.matrix for place in fresh])
             yield fresh
 
     def _look_for(self, anchor: int) -> None:
@@ -186,18 +184,19 @@ class TripleEstimator:
         self._n_rounds += 1
         self._anchors.add(anchor)
 
-    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
-        """Return whether a camera can have seen a grown hypothesis."""
-        hypothesis.fault = self.judge(hypothesis.matrix, rough=True)
-        if hypothesis.fault is not None:
-            self.events.note("refused", hypothesis.fault, hypothesis.matrix)
-        return hypothesis.fault is None
+    def _is_plausible(self, place: Place) -> bool:
+        """Return whether a camera can have seen a place that grew."""
+        fault = self.judge(place.matrix, rough=True)
+        if fault is not None:
+            self.events.note("refused", fault, place.matrix)
+        return fault is None
 
-    def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
-        """Return whether another intersection proposed a promising verified place as well."""
-        return known.log10_likelihood >= _LEAST_LIKELY and self.same(known, hypothesis)
+    def _is_met_again(self, other: Place, place: Place) -> bool:
+        """Return whether a place is what became of another that turned out promising."""
+        settled = self._settled.get(other)
+        return settled is not None and settled.log10_likelihood >= _LEAST_LIKELY and settled.same(place)
 
-    def known_places(self) -> list[Hypothesis]:
+    def known_places(self) -> list[Place]:
         """Return the verified places that fit."""
         return self._whole
 
@@ -228,143 +227,128 @@ class TripleEstimator:
             allowed &= away_m < self.near[2] + frame
         return allowed & (self.options.camera.turned_off(j01, j11) < AGREE_DEG)
 
-    def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+    def grow(self, proposals: Proposals, chosen: IntArray) -> list[Place]:
         """Grow the chosen proposals of an anchor; return those that were not given up, the best supported first."""
         return grow_proposals(self.scene, self.index, proposals, chosen, self.options.camera)
 
-    def follow_up(self, proposals: Proposals, chosen: IntArray) -> Iterator[Hypothesis]:
+    def follow_up(self, proposals: Proposals, chosen: IntArray) -> Iterator[Place]:
         """Yield the grown proposals of an anchor that are different places and that a camera can have seen."""
         self.n_hypotheses += len(chosen)
         grown = self.grow(proposals, chosen)
-        self.events.note("grown", [hypothesis.matrix for hypothesis in grown])
-        distinct: list[Hypothesis] = []
-        for h in filter(self._is_plausible, grown):
-            if not any(self.same(h, other) for other in (*self._whole, *distinct)):
-                distinct.append(h)
-                yield h
+        self.events.note("grown", [place.matrix for place in grown])
+        distinct: list[Place] = []
+        for place in filter(self._is_plausible, grown):
+            if not any(place.same(other) for other in (*self._whole, *distinct)):
+                distinct.append(place)
+                yield place
 
-    def score(self, model: Hypothesis) -> float:
-        """Refine a hypothesis and return its log10 odds: its lead over the best place nearby."""
+    def settle(self, place: Place) -> tuple[Place, float]:
+        """Return a place refined, and its score: its lead over the places that were met, and over those nearby."""
         started = time.perf_counter()
         self.n_verified += 1
-        self._verify(model)
-        if model.log10_odds >= _LEADING:
-            self._look_through_lens(model)
-        if math.isfinite(model.log10_odds):
-            self.verified.append(model)
+        settled = self._verify(place)
+        if settled.score >= _LEADING:
+            settled = self._look_through_lens(settled)
+        if math.isfinite(settled.score):
+            self.verified.append(settled)
+        self._settled[place] = settled
         self.refine_s += time.perf_counter() - started
-        fault = None if math.isfinite(model.log10_odds) else model.fault
-        self.events.note("scored", Scored(model, model.log10_odds, fault))
-        if not model.by_roads and self._fits_whole(model):
-            self._whole.append(model)
-        return model.log10_odds
+        self.events.note("settled", settled)
+        if not settled.by_roads and self._fits_whole(settled):
+            self._whole.append(settled)
+        return settled, settled.score
 
-    def _verify(self, model: Hypothesis) -> None:
-        """Refine a hypothesis with more and more points, as long as it may be the best place, or its rival."""
-        best = max((known.log10_likelihood for known in self.verified), default=0.0)
-        if model.by_roads and best > 0.0:
-            as_grown = Evidence(self.scene, self.index, sampling(model.matrix, self.scene.size))
-            model.log10_likelihood = as_grown.weigh(model.matrix)
-            if model.log10_likelihood < _HARDLY * best:
-                self._charge(model)
-                return
+    def _verify(self, place: Place) -> Place:
+        """Refine a place with more and more points, as long as it may be the best place, or its rival."""
+        best = max((other.log10_likelihood for other in self.verified), default=0.0)
+        if place.by_roads and 0.0 < _HARDLY * best > place.log10_likelihood:
+            return self._scored(place)
         for n_points, least in ((150, _BEHIND[0] * best), (300, _BEHIND[1] * best), (None, 0.0)):
-            if not self._converge(model, n_points, _HARDLY * best):
-                model.log10_odds = -math.inf
-                return
-            if model.log10_likelihood < max(_LEAST_LIKELY, least):
-                self._charge(model)
-                return
-        self._weigh(model)
+            place, converged = self._converge(place, n_points, _HARDLY * best)
+            if not converged:
+                return place
+            if place.log10_likelihood < max(_LEAST_LIKELY, least):
+                return self._scored(place)
+        return self._weigh(place)
 
-    def refine_whole(self, model: Hypothesis) -> None:
-        """Refine a verified hypothesis with all points, which may have been given up before."""
-        if model.refined is not None and model.refined.lens_k1 == 0.0:
-            self._converge(model, None, -math.inf)
+    def refine_whole(self, place: Place) -> Place:
+        """Return a verified place refined with all points, which may have been given up before."""
+        if place.refined is None or place.lens_k1 != 0.0:
+            return place
+        return self._converge(place, None, -math.inf)[0].but(fault=None, score=place.score)
 
-    def _weigh(self, model: Hypothesis) -> None:
-        """Weigh a hypothesis, and, if it leads all other verified places, the best place nearby."""
-        self._charge(model)
-        if model.log10_odds >= _LEADING:
-            self.nearby(model)
-            self._charge(model)
+    def _weigh(self, place: Place) -> Place:
+        """Score a place, and, if it leads all other verified places, compare it with the best place nearby."""
+        scored = self._scored(place)
+        if scored.score >= _LEADING:
+            self.nearby(scored)
+            scored = self._scored(scored)
+        return scored
 
-    def nearby(self, model: Hypothesis) -> float:
+    def nearby(self, place: Place) -> float:
         """Return the log10 likelihood of the best place nearby (see `Evidence.nearby`); computed once."""
-        if model.nearby is None:
+        if place not in self._nearby:
             self.n_nulls += 1
-            gsd_m = sampling(model.matrix, self.scene.size)
-            model.nearby = Evidence(self.scene_of(model), self.index, gsd_m).nearby(model.matrix, self.near)
-        return model.nearby
+            self._nearby[place] = place.evidence.nearby(place.matrix, self.near)
+        return self._nearby[place]
 
-    def _charge(self, model: Hypothesis) -> None:
-        """Score a hypothesis: its lead over other places, less the log10 number of places tried."""
-        most = max(model.nearby or 0.0, self._most_elsewhere(model), 0.0)
-        model.log10_odds = model.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1))
+    def _scored(self, place: Place) -> Place:
+        """Return a place with its lead over the other places met, less the log10 number of places tried."""
+        most = max(self._nearby.get(place, 0.0), self._most_elsewhere(place), 0.0)
+        scored = place.but(score=place.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1)))
+        if place in self._nearby:
+            self._nearby[scored] = self._nearby[place]
+        return scored
 
-    def _most_elsewhere(self, model: Hypothesis) -> float:
+    def _most_elsewhere(self, place: Place) -> float:
         """Return the log10 likelihood of the best other verified place."""
-        likely = sorted(self.verified, key=lambda known: -known.log10_likelihood)
-        return next((known.log10_likelihood for known in likely if not self.same(known, model)), 0.0)
+        likely = sorted(self.verified, key=lambda other: -other.log10_likelihood)
+        return next((other.log10_likelihood for other in likely if not other.same(place)), 0.0)
 
-    def _look_through_lens(self, model: Hypothesis) -> None:
-        """Add a lens to a promising place if the lens explains it better."""
-        index, refined, agreeing = self.index, model.refined, model.found
-        if not self.options.lens or refined is None or agreeing is None:
-            return
-        if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
-            return
-        self._looked.append((model, agreeing.forward))
+    def _look_through_lens(self, place: Place) -> Place:
+        """Return a promising place with a lens, if the lens explains it better."""
+        index, refined, forward = self.index, place.refined, place.agreement.forward
+        if not self.options.lens or refined is None:
+            return place
+        if any(share > forward - _BETTER and other.same(place) for other, share in self._fitted):
+            return place
+        self._fitted.append((place, forward))
         lens = find_lens(refined.matrix, self.scene, index, self.refine_options)
-        if lens is None and agreeing.forward < ENOUGH:
+        if lens is None and forward < ENOUGH:
             lens = grow_whole(refined.matrix, self.scene, index, self.refine_options)
         if lens is None or not self.may_be(lens.matrix):
-            return
+            return place
         scene = straighten_scene(self.scene, lens.lens_k1) if lens.lens_k1 else self.scene
-        seen = model.lay(lens, scene, index)
-        self._weigh(seen)
-        if seen.log10_odds >= model.log10_odds and seen.found is not None and seen.found.forward >= agreeing.forward:
-            model.take(seen)
+        bent = self._weigh(place.at(lens, scene))
+        return bent if bent.score >= place.score and bent.agreement.forward >= forward else place
 
-    def picture(self, model: Hypothesis, gsd_m: float) -> Picture:
-        """Return the picture as a hypothesis straightens it, to be weighed at this many metres per pixel."""
-        return Picture(self.scene_of(model), self.index, gsd_m)
-
-    def scene_of(self, model: Hypothesis) -> Scene:
-        """Return the scene without the distortion that a hypothesis found."""
-        lens_k1 = 0.0 if model.refined is None else model.refined.lens_k1
-        return straighten_scene(self.scene, lens_k1) if lens_k1 else self.scene
-
-    def _converge(self, model: Hypothesis, n_points: int | None, least: float) -> bool:
+    def _converge(self, place: Place, n_points: int | None, least: float) -> tuple[Place, bool]:
         """Refine until the agreement stops growing: more matches make a better fit, which finds more matches.
 
-        A place less likely than `least` is not refined again.
+        A place less likely than `least` is not refined again. Also returns whether it converged.
         """
-        scene, before = self.scene, -1.0 if model.found is None else model.found.forward
-        best, options = -1.0, self.refinement(model)
+        before, best = -1.0 if place.refined is None else place.agreement.forward, -1.0
+        options = self.refinement(place)
         for _ in range(5):
-            refined = refine(model.matrix, scene, self.index, model.matched, options, n_points, model.by_roads)
-            model.fault = None if refined is None else self.judge(refined.matrix)
-            if refined is None or model.fault is not None or self._is_far(refined.matrix):
-                return model.refined is not None and best >= 0.0
-            laid = model.lay(refined, scene, self.index)
-            agreeing = 0.0 if laid.found is None else laid.found.forward
+            args = place.matrix, place.scene, place.index, place.matched
+            refined = refine(*args, options, n_points, held=place.by_roads)
+            fault = None if refined is None else self.judge(refined.matrix)
+            if refined is None or fault is not None or self._is_far(refined.matrix):
+                return (place, True) if best >= 0.0 else (place.but(fault=fault, score=-math.inf), False)
+            laid = place.at(refined)
+            agreeing = laid.agreement.forward
             if agreeing < best:
                 break
-            model.take(laid)
+            place = laid
             if agreeing <= max(before, best) + 0.01 or laid.log10_likelihood < least:
                 break
             best = agreeing
-        return True
+        return place, True
 
-    def explained(self, model: Hypothesis) -> float:
-        """Return the likelihood of a place, scaled so that places of different scale compare (see `statement_px`)."""
-        return model.log10_likelihood * statement_px(sampling(model.matrix, self.scene.size))
-
-    def refinement(self, model: Hypothesis) -> RefineOptions:
-        """Return the options for refining a hypothesis."""
+    def refinement(self, place: Place) -> RefineOptions:
+        """Return the options for refining a place."""
         usual = self.refine_options
-        return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if model.by_roads and self.options.roads else usual
+        return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if place.by_roads and self.options.roads else usual
 
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""
@@ -383,18 +367,9 @@ class TripleEstimator:
             return True
         return within is not None and not lies_in(within, *to_lonlat(plane.crs, plane.to_crs(middle[None]))[0])
 
-    def _fits_whole(self, model: Hypothesis) -> bool:
-        """Return whether a hypothesis fits the whole frame: no better variant of it is expected."""
-        if model.found is None or model.refined is None or not math.isfinite(model.log10_odds):
+    def _fits_whole(self, place: Place) -> bool:
+        """Return whether a place fits the whole frame: no better variant of it is expected."""
+        if place.refined is None or not math.isfinite(place.score):
             return False
-        frame_m = 2.0 * self.scene.half_size * sampling(model.matrix, self.scene.size)
-        return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
-
-    def center(self, model: Hypothesis) -> FloatArray:
-        """Where the middle of the frame lies, in plane metres."""
-        return np.array(model.spot(self.scene.size)[:2])
-
-    def same(self, a: Hypothesis, b: Hypothesis) -> bool:
-        """Return whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size."""
-        (x, y, reach_m), (other_x, other_y, _) = a.spot(self.scene.size), b.spot(self.scene.size)
-        return math.hypot(x - other_x, y - other_y) < reach_m
+        frame_m = 2.0 * self.scene.half_size * place.gsd_m
+        return place.agreement.forward >= 0.65 and bool(place.refined.corner_sigma_m.max() <= 0.005 * frame_m)

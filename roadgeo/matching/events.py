@@ -3,24 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-if TYPE_CHECKING:
-    from roadgeo.geometry.camera import CameraFault
-    from roadgeo.matching.estimator import TripleEstimator
-    from roadgeo.matching.growing import Hypothesis
-    from roadgeo.matching.search import Search
-
-
-__all__ = ["Events", "Ledger", "Scored"]
-
-
-class Scored(NamedTuple):
-    """A verified hypothesis, its score, and the camera's objection if it was refused."""
-
-    model: Hypothesis
-    log10_odds: float
-    fault: CameraFault | None = None
+__all__ = ["Events", "Ledger"]
 
 
 @dataclass
@@ -33,12 +18,10 @@ class Events:
     - "voted": an intersection, and the number of places to grow that it and the roads around it proposed;
     - "grown": homographies (3, 3) that grew;
     - "refused": the camera's objection, and a grown homography that no camera can have seen;
-    - "scored": a `Scored`.
+    - "settled": a `Place` that was verified, or refused for its `fault`.
     """
 
     kept: bool = False
-    estimator: TripleEstimator | None = None  # where anything was searched, and is kept
-    result: Search[Hypothesis] | None = None
     items: list[tuple[Any, ...]] = field(default_factory=list)
 
     def note(self, kind: str, *what: Any) -> None:

@@ -24,7 +24,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
@@ -33,7 +33,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.shifts import shifted
 
-__all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
+__all__ = ["Agreement", "Evidence", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
@@ -70,8 +70,6 @@ class Agreement:
 
     Attributes
     ----------
-    matched, tested : int
-        Intersections of the query that match an intersection of the map, and all intersections of the query.
     forward, backward : float
         Share of the query's roads on roads of the map, and of the map's roads on roads of the query, within three
         standard deviations.
@@ -79,21 +77,9 @@ class Agreement:
         Likelihood of `Evidence` at the place's own metres per pixel.
     """
 
-    matched: int
-    tested: int
     forward: float
     backward: float
     log10_likelihood: float = -math.inf
-
-    @property
-    def rate(self) -> float:
-        """Share of intersections matched."""
-        return self.matched / max(self.tested, 1)
-
-    @property
-    def mean(self) -> float:
-        """Mean of the shares of intersections, of the query's roads and of the map's roads that agree."""
-        return (self.rate + self.forward + self.backward) / 3
 
 
 class Evidence:
@@ -104,12 +90,14 @@ class Evidence:
     gsd_m : float
         Metres per pixel by which roads are measured. Residuals of a place at another scale are compared in pixels: in
         metres, roads would always agree where the frame is small on the ground.
+    statement_px : float
+        Pixels of road that count as one independent statement.
     """
 
     def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
         self._sigma_m = math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
-        self._statement_px = statement_px(gsd_m)
+        self.statement_px = statement_px(gsd_m)
         self._piece_px = max(_PIECE_M / gsd_m, _PIECE_PX)
         width, height = scene.size
         self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
@@ -121,11 +109,11 @@ class Evidence:
         seen, mapped = self._count(matrix, math.inf, (1, 1))
         return self._log10(seen[0], mapped[0])
 
-    def agreement(self, matrix: FloatArray, matched: IntArray) -> Agreement:
-        """Return the agreement at a place, with the map's intersection `matched` (N,) to each of the query's, or -1."""
+    def agreement(self, matrix: FloatArray) -> Agreement:
+        """Return the agreement at a place."""
         seen, mapped = self._count(matrix, math.inf, (1, 1))
         forward, backward = (float(bins[0, :_AGREEING].sum() / max(bins.sum(), 1e-9)) for bins in (seen, mapped))
-        return Agreement(int((matched >= 0).sum()), len(matched), forward, backward, self._log10(seen[0], mapped[0]))
+        return Agreement(forward, backward, self._log10(seen[0], mapped[0]))
 
     def _log10(self, seen: FloatArray, mapped: FloatArray) -> float:
         """Return log10 L of histograms."""
@@ -171,6 +159,13 @@ class Evidence:
         alike = (across < 2.0 * reach_m) & (np.hypot(*moved.T) < _PIECE_M)
         return float(alike.mean()) if on_road.any() else 0.0
 
+    def on_roads(self, matrix: FloatArray) -> BoolArray:
+        """Return which road points (S,) lie on roads of the map that run their way."""
+        scene = self.scene
+        met, radii = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(self.gsd_m))
+        road_residuals(matrix, scene.points, scene.directions, radii, MIN_COS, self.index.road_buckets, met)
+        return np.asarray(np.isfinite(met[:, 0]))
+
     def contradicted(self, matrix: FloatArray) -> float:
         """Return the share of roads in regions of the frame where the place explains little or nothing.
 
@@ -197,10 +192,14 @@ class Evidence:
         share = float(both[worth < least].sum() / both.sum())
         return max(share - 0.5 / len(both), 0.0)  # half a region is usual: a railway may run through it
 
+    def _scale(self, matrix: FloatArray) -> float:
+        """Return how many times larger a place's pixels are than those by which roads are measured."""
+        return sampling(matrix, self.scene.size) / self.gsd_m
+
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
         scene, index = self.scene, self.index
-        scale = sampling(matrix, scene.size) / self.gsd_m
+        scale = self._scale(matrix)
         ground, step_m = Homography(matrix).everywhere(scene.corners), max(STEP_M, scene.field_scale * self.gsd_m)
         seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
@@ -224,7 +223,7 @@ class Evidence:
 
     def _nats(self, of_query: FloatArray, of_map: FloatArray, seen: FloatArray, mapped: FloatArray) -> FloatArray:
         """Return log L by (sigma, missing, false)."""
-        return np.asarray(((of_query @ seen)[:, None, :] + (of_map @ mapped)[:, :, None]) / self._statement_px)
+        return np.asarray(((of_query @ seen)[:, None, :] + (of_map @ mapped)[:, :, None]) / self.statement_px)
 
     def nearby(
         self,
@@ -240,7 +239,7 @@ class Evidence:
         (x, y, radius), plane metres.
         """
         scene = self.scene
-        reach_m = 2.0 * self._sigma_m * sampling(matrix, scene.size) / self.gsd_m
+        reach_m = 2.0 * self._sigma_m * self._scale(matrix)
         shifts = np.concatenate(
             (self._spiral(reach_m, n_shifts), self._onto_neighbours(matrix, reach_m, near, n_anchors))
         )
@@ -301,19 +300,15 @@ def tolerance_m(gsd_m: float) -> float:
     return 3.0 * math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
 
 
-def match_intersections(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[IntArray, FloatArray]:
+def match_intersections(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
+) -> tuple[IntArray, FloatArray]:
     """Return the map intersection matched to each query intersection (N,), or -1, and their distance (N,), metres."""
     found = scene.intersections
     matched, distance = np.empty(len(found), np.int64), np.empty(len(found))
-    reach_m = 1.5 * tolerance_m(sampling(matrix, scene.size))
+    reach_m = 1.5 * tolerance_m(gsd_m)
     match_all(matrix, found.xy, scene.branches, reach_m, MIN_COS, index.point_buckets, matched, distance)
     return matched, distance
-
-
-def agreement(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[Agreement, IntArray, FloatArray]:
-    """Return the agreement at a place, and its matched intersections and their distances (`match_intersections`)."""
-    matched, distance = match_intersections(matrix, scene, index)
-    return Evidence(scene, index, sampling(matrix, scene.size)).agreement(matrix, matched), matched, distance
 
 
 def _anyhow(expected: float) -> int:

@@ -1,6 +1,6 @@
 """Why a mask was or was not located: how far the search got, the best rejected places, and the missing evidence.
 
-`Explanation.to_dict` gives schema `roadgeo.explanation/1`, which `outputs/schemas` describes.
+`Explanation.to_dict` gives schema `roadgeo.explanation/2`, which `outputs/schemas` describes.
 """
 
 from __future__ import annotations
@@ -15,27 +15,23 @@ from typing import Any
 import numpy as np
 
 from roadgeo import __version__
-from roadgeo._arrays import BoolArray, FloatArray
-from roadgeo.geometry.camera import CameraFault, CameraOptions, CameraPose, pose
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.camera import CameraFault, CameraOptions, pose
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.kernels.roads import road_residuals
-from roadgeo.location import Location, Place
+from roadgeo.location import Location
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.evidence import agreement, tolerance_m
-from roadgeo.matching.growing import Hypothesis
-from roadgeo.matching.methods import Found
+from roadgeo.matching.methods import Searched, less_than
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.scene import MIN_COS, Query, Scene
+from roadgeo.matching.place import Place
+from roadgeo.matching.rivals import Rivals
+from roadgeo.matching.scene import Query, Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.truth import TruthStory, finite_or_none, tell_truth, true_place
-from roadgeo.matching.verdict import center_of, decide
+from roadgeo.matching.verdict import decide
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "Story", "Told", "tell"]
 
-SCHEMA = "roadgeo.explanation/1"
+SCHEMA = "roadgeo.explanation/2"
 
 #: Most places that are shown, and most refused places that are verified without limits.
 _MAX_PLACES = 6
@@ -73,51 +69,44 @@ class Funnel:
 
 
 @dataclass(frozen=True)
-class RejectedPlace:
-    """A verified place, and `why` it is not the answer; the answer itself comes first, and its `why` states that.
+class Told:
+    """A place that was met, and `why` it is not the answer; of the answer itself, which comes first, that it is.
 
     Attributes
     ----------
-    scored : Scored
-        The hypothesis, its odds, and the camera's objection if that ended it.
-    footprint, footprint_lonlat : (4, 2) float64
-        Corners TL, TR, BR, BL, plane metres and longitude, latitude.
-    agrees : (S,) bool
-        Which of the scene's road points lie on roads of the map that run their way.
     nearby : float
         Log10 likelihood of the best place nearby; 0 if nothing could be compared.
     """
 
-    scored: Scored
-    camera: CameraPose
-    center: Place
-    footprint: FloatArray
-    footprint_lonlat: FloatArray
-    agrees: BoolArray
+    place: Place
     nearby: float
-    why: str = ""
+    why: str
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
-        model, center, camera = self.scored.model, self.center, self.camera
-        found = model.found
+        place, plane = self.place, self.place.index.plane
+        camera, agreement = pose(place.matrix, place.scene.size), place.agreement
+        x, y = plane.to_crs(place.center).tolist()
+        lon, lat = place.lonlat.tolist()
+        matched = int((place.matches[0] >= 0).sum())
         return {
             "why": self.why,
-            "log10_odds": finite_or_none(self.scored.log10_odds),
-            "center": {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
-            "footprint_lonlat": self.footprint_lonlat.tolist(),
+            "log10_odds": finite_or_none(place.score),
+            "center": {"x": x, "y": y, "lon": lon, "lat": lat},
+            "footprint_lonlat": to_lonlat(plane.crs, plane.to_crs(place.corners)).tolist(),
             "gsd_m": camera.gsd_m,
             "rotation_deg": camera.rotation_deg,
             "tilt_deg": camera.tilt_deg,
-            "agreement": found
-            and {
-                "intersections": found.rate,
-                "intersections_matched": found.matched,
-                "intersections_tested": found.tested,
-                "roads_of_mask": found.forward,
-                "roads_of_map": found.backward,
+            "agreement": None
+            if place.refined is None
+            else {
+                "intersections": matched / max(len(place.scene.intersections), 1),
+                "intersections_matched": matched,
+                "intersections_tested": len(place.scene.intersections),
+                "roads_of_mask": agreement.forward,
+                "roads_of_map": agreement.backward,
             },
-            "log10_likelihood": finite_or_none(model.log10_likelihood),
+            "log10_likelihood": finite_or_none(agreement.log10_likelihood),
             "nearby": self.nearby,
         }
 
@@ -130,32 +119,33 @@ class Story:
     ----------
     stopped : str
         As in `Search`; "elsewhere": a place on another reference ended it, "": there was nothing to search for.
-    needed : dict
-        The log10 odds and the margin that an answer needs.
+    needed : float
+        The score that an answer needs.
     camera_refusals : dict
         The number of times each reason kept a grown place from being verified.
     starved_at : str or None
-        The first stage without a result, "camera", "odds" or "margin"; None if the mask was located.
+        The first stage without a result, "camera" or "odds"; None if the mask was located.
     """
 
     reference: str
     stopped: str
-    needed: dict[str, float]
+    needed: float
     funnel: Funnel
     camera_refusals: dict[str, int]
     starved_at: str | None
     missing: tuple[str, ...]
-    places: tuple[RejectedPlace, ...] = ()
+    places: tuple[Told, ...] = ()
     truth: TruthStory | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
-        plain = ("reference", "stopped", "needed", "camera_refusals", "starved_at")
+        plain = ("reference", "stopped", "camera_refusals", "starved_at")
         return {
             **{name: getattr(self, name) for name in plain},
+            "needed": {"log10_odds": self.needed},
             "funnel": asdict(self.funnel),
             "missing": list(self.missing),
-            "places": [place.to_dict() for place in self.places],
+            "places": [told.to_dict() for told in self.places],
             "truth": self.truth and asdict(self.truth),
         }
 
@@ -178,7 +168,7 @@ class Explanation:
         """The story of the reference on which the mask was located, or came nearest to it."""
 
         def rank(story: Story) -> tuple[bool, float]:
-            best = max((place.scored.log10_odds for place in story.places), default=-math.inf)
+            best = max((told.place.score for told in story.places), default=-math.inf)
             return self.location.located and story.reference == self.location.reference, best
 
         return max(self.stories, key=rank)
@@ -205,26 +195,25 @@ class Explanation:
         }
 
 
-def tell(query: Query, found: Found, options: LocateOptions) -> Story:
+def tell(query: Query, searched: Searched, options: LocateOptions) -> Story:
     """Describe the search on one reference."""
-    location = decide(query, [found], options)  # its answer on that reference alone
-    needed = {"log10_odds": options.min_log10_odds, "margin": options.min_margin}
-    n, name, located, events = len(query.scene.intersections), found.index.name, location.located, found.events
-    search, result, stats = events.estimator, events.result, found.stats
-    if search is None or result is None:  # there was nothing to search for, or another method searched
+    location = decide(query, [searched], options)  # its answer on that reference alone
+    n, name, stats = len(query.scene.intersections), searched.index.name, searched.stats
+    located, needed = location.located, options.min_log10_odds
+    if searched.estimator is None or searched.search is None:  # nothing to search for, or another method searched
         ended = "intersections" if n == 0 else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
         missing: tuple[str, ...] = () if located else (location.reason,)
         story = Story(name, "", needed, funnel, {}, None if located else ended, missing)
     else:
-        course = _Course(events, search, result, location, options)
+        course = _Course(searched, searched.estimator, searched.search, location, needed)
         counts = {fault.value: times for fault, times in course.refusals.most_common()}
         starved, missing = (None, ()) if located else (course.starved, tuple(course.missing()))
-        story = Story(name, result.stopped, needed, course.funnel, counts, starved, missing, course.places)
+        story = Story(name, searched.stopped, needed, course.funnel, counts, starved, missing, course.places)
     truth = true_place(query.name, options)
     if truth is None:
         return story
-    fate = tell_truth(truth, events, location, options)
+    fate = tell_truth(truth, searched, location, options)
     return replace(story, truth=fate, missing=story.missing if fate.lost_at is None else (fate.said, *story.missing))
 
 
@@ -232,64 +221,65 @@ class _Course:
     """The course of a search: its events, counted and described."""
 
     def __init__(
-        self,
-        events: Events,
-        search: TripleEstimator,
-        result: Search[Hypothesis],
-        location: Location,
-        options: LocateOptions,
+        self, searched: Searched, estimator: TripleEstimator, search: Search[Place], location: Location, needed: float
     ) -> None:
-        self.events, self.search, self.result = events, search, result
-        self.location, self.needed, self.margin = location, options.min_log10_odds, options.min_margin
+        self.searched, self.estimator, self.search = searched, estimator, search
+        self.events, self.location, self.needed = searched.events, location, needed
         self.funnel = self._count()  # before further places are compared, to be shown
         self._look_elsewhere()
-        scored = events.of("scored")
+        settled = self.events.of("settled")
         self.refusals = Counter(
-            [fault for fault, _ in events.of("refused")] + [entry.fault for entry in scored if entry.fault]
+            [fault for fault, _ in self.events.of("refused")] + [place.fault for place in settled if place.fault]
         )
-        entries = [*scored, *([] if location.located else self._without_limits())]
-        self.places = tuple(map(self._describe, self._distinct(sorted(entries, key=self._rank))))
+        listed = [*searched.compared, *searched.places[1:]]
+        others = [less_than(listed[0], place) if listed else place for place in settled]
+        entries = [*listed, *others, *([] if location.located else self._without_limits())]
+        self.places = tuple(map(self._tell, self._distinct(sorted(entries, key=self._rank))))
 
     def _look_elsewhere(self) -> None:
         """Grow some proposals that the hints bar, to report that they would fit."""
         for proposals, allowed, _ in self.events.of("screened"):
             barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
-            for hypothesis in self.search.grow(barred, np.arange(len(barred.reference)))[:_MAX_PLACES]:
-                fault = self.search.judge(hypothesis.matrix, rough=True)
+            for place in self.estimator.grow(barred, np.arange(len(barred.reference)))[:_MAX_PLACES]:
+                fault = self.estimator.judge(place.matrix, rough=True)
                 if fault is not None:
-                    self.events.note("refused", fault, hypothesis.matrix)
+                    self.events.note("refused", fault, place.matrix)
 
-    def _without_limits(self) -> list[Scored]:
-        """Verify the best places that the camera's limits refused, without these limits."""
-        scene, index, options = self.search.scene, self.search.index, self.search.options
+    def _without_limits(self) -> list[Place]:
+        """Verify the best places that the camera's limits refused without these limits, and score them."""
+        scene, index, options = self.estimator.scene, self.estimator.index, self.estimator.options
         camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-        free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=self.search.ledger)
-        compared = []
-        negotiable = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
-        for fault, unscaled in islice(negotiable, _MAX_REFUSED):
-            matrix = unscaled / unscaled[2, 2]
-            found, matched, _ = agreement(matrix, scene, index)
-            compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
-        compared.sort(key=lambda entry: -entry[0])
-        return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_PLACES]]
+        free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=self.estimator.ledger)
+        refusals = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
+        refused = [
+            (fault, Place(scene, index, matrix / matrix[2, 2], by_roads=False))
+            for fault, matrix in islice(refusals, _MAX_REFUSED)
+        ]
+        refused.sort(key=lambda pair: -(pair[1].rate + pair[1].agreement.forward))
+        settled = [(fault, free.settle(place)[0]) for fault, place in refused[:_MAX_PLACES]]
+        search: Search[Place] = Search(free)
+        best = Rivals({search: free}, self.estimator.ledger, self.needed).compare(search)
+        if best is None:
+            return [place.but(fault=fault) for fault, place in settled]
+        return [(best if best.same(place) else less_than(best, place)).but(fault=fault) for fault, place in settled]
 
-    def _rank(self, entry: Scored) -> tuple[bool, float]:
+    def _rank(self, place: Place) -> tuple[bool, float]:
         """Sort by score; refused places come last, unless the camera's limits alone kept them from being the answer."""
-        return entry.fault is not None and entry.log10_odds < self.needed, -entry.log10_odds
+        return place.fault is not None and place.score < self.needed, -place.score
 
-    def _distinct(self, entries: Sequence[Scored]) -> list[Scored]:
+    def _distinct(self, places: Sequence[Place]) -> list[Place]:
         """Return the best entry of each place."""
-        kept: list[Scored] = []
-        for entry in entries:
-            if len(kept) == _MAX_PLACES or (kept and not math.isfinite(entry.log10_odds)):
+        kept: list[Place] = []
+        for place in places:
+            if len(kept) == _MAX_PLACES or (kept and not math.isfinite(place.score)):
                 break
-            if not any(self.search.same(entry.model, other.model) for other in kept):
-                kept.append(entry)
+            if not any(place.same(other) for other in kept):
+                kept.append(place)
         return kept
 
     def _count(self) -> Funnel:
         """Count the results of each stage of the search."""
-        search, events = self.search, self.events
+        search, events = self.estimator, self.events
         screened, voted = events.of("screened"), events.of("voted")
         proposed = sum(count for _, count in voted)  # all of them lie on roads
         return Funnel(
@@ -305,35 +295,20 @@ class _Course:
             search.n_nulls,
         )
 
-    def _describe(self, entry: Scored) -> RejectedPlace:
+    def _tell(self, place: Place) -> Told:
         """Describe a place that was verified."""
-        matrix, index = entry.model.matrix, self.search.index
-        scene = self.search.scene_of(entry.model)
-        camera = pose(matrix, scene.size)
-        # which of the query's road points agree
-        away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m))
-        road_residuals(matrix, scene.points, scene.directions, near, MIN_COS, index.road_buckets, away)
-        ground = Homography(matrix).everywhere(scene.corners)
-        lonlat = to_lonlat(index.plane.crs, index.plane.to_crs(ground))
-        center = center_of(matrix, scene, index.plane, entry.log10_odds)
-        nearby = 0.0 if entry.model.found is None else self.search.nearby(entry.model)
-        place = RejectedPlace(entry, camera, center, ground, lonlat, np.isfinite(away[:, 0]), nearby)
-        return replace(place, why=self._why(place))
+        nearby = 0.0 if place.refined is None else self.estimator.nearby(place)
+        return Told(place, nearby, self._why(place, nearby))
 
-    def _why(self, place: RejectedPlace) -> str:
+    def _why(self, place: Place, nearby: float) -> str:
         """Return why a place is not the answer."""
-        entry = place.scored
-        if entry.fault is not None:
+        if place.fault is not None:
             return f"the camera: {_objection(place)}"
-        if not math.isfinite(entry.log10_odds):
+        if not math.isfinite(place.score):
             return "the fit does not converge to a place within the limits"
-        if entry.model is self.result.best and self.location.located:
-            return "located"
-        if entry.log10_odds >= self.needed:
-            if self.result.score - entry.log10_odds < self.margin:
-                return f"fits as well as another place: the margin is below {self.margin:g}"
-            return f"another place has log10 odds {_number(self.result.score)}"
-        return f"log10 odds {_number(entry.log10_odds)} of {self.needed:g} needed: {_weakest(place)}"
+        if place.score >= self.needed:
+            return "located" if self.location.located else self.location.reason
+        return f"score {_number(place.score)}, {self.needed:g} is needed: {_weakest(place, nearby)}"
 
     @property
     def starved(self) -> str:
@@ -341,35 +316,35 @@ class _Course:
         stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
         empty = next((stage for stage in stages if getattr(self.funnel, stage) == 0), None)
         if empty is None:
-            return "odds" if self.result.score < self.needed else "margin"
+            return "odds"
         return "camera" if empty == "verified" and self.refusals else empty
 
     def missing(self) -> list[str]:
         """List the missing evidence, the surest first."""
         lines, n, starved = [], self.funnel.intersections, self.starved
-        if self.result.stopped in ("time", "work"):
-            lines.append(f"{self.result.stopped}: the search was stopped by its limit, places may be left untried")
+        if self.searched.stopped in ("time", "work"):
+            lines.append(f"{self.searched.stopped}: the search was stopped by its limit, places may be left untried")
         if starved in _NOTHING:
             lines.append(_NOTHING[starved])
         if starved == "camera":
             reasons = ", ".join(f"{fault.value} ({times})" for fault, times in self.refusals.most_common())
             lines.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
         best = self.places[0] if self.places else None
-        if best is not None and best.scored.fault is not None and best.scored.log10_odds >= self.needed:
-            objection = _objection(best)
+        if best is not None and best.place.fault is not None and best.place.score >= self.needed:
+            objection = _objection(best.place)
             lines.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
         elif best is not None and starved == "odds":
-            lines.append(f"evidence: at the best place {_weakest(best)}")
-        if starved == "margin":
+            lines.append(f"evidence: at the best place {_weakest(best.place, best.nearby)}")
+        if starved == "odds" and self.searched.places and self.searched.places[0].rival is not None:
             lines.append(
                 "difference: another place fits almost as well; more of the surroundings in view would tell them apart"
             )
         if n < _USUAL_INTERSECTIONS:
             few = f"masks with fewer than {_USUAL_INTERSECTIONS} are seldom located"
             lines.append(f"intersections: {n} are seen; {few}")
-        if best is not None and best.nearby > 0.5 * best.scored.model.log10_likelihood > 0.0:
+        if best is not None and best.nearby > 0.5 * best.place.agreement.log10_likelihood > 0.0:
             lines.append("variety: streets here are so alike that a shifted copy explains half as much and more")
-        if self.search.near is not None and not self.places:
+        if self.estimator.near is not None and not self.places:
             lines.append("perhaps the circle given is wrong: nothing outside it was tried")
         return lines or ["agreement: nothing on this map is like the mask; another map may be needed"]
 
@@ -379,21 +354,21 @@ def _number(value: float) -> str:
     return f"{round(value, 1) + 0.0:.1f}"
 
 
-def _objection(place: RejectedPlace) -> str:
-    """Return the camera's objection to a place, and its odds otherwise."""
-    fault, odds, camera = place.scored.fault, place.scored.log10_odds, place.camera
+def _objection(place: Place) -> str:
+    """Return the camera's objection to a place, and its score otherwise."""
+    camera = pose(place.matrix, place.scene.size)
     values = {
         CameraFault.SAMPLING: f" ({camera.gsd_m:.2f} m per pixel)",
         CameraFault.TILT: f" ({camera.tilt_deg:.0f} degrees)",
         CameraFault.HEADING: f" (up is {camera.rotation_deg % 360:.0f} degrees)",
     }
-    otherwise = f"; without that its log10 odds were {_number(odds)}" if math.isfinite(odds) else ""
-    return "" if fault is None else f"{fault.value}{values.get(fault, '')}{otherwise}"
+    otherwise = f"; without that its score were {_number(place.score)}" if math.isfinite(place.score) else ""
+    return "" if place.fault is None else f"{place.fault.value}{values.get(place.fault, '')}{otherwise}"
 
 
-def _weakest(place: RejectedPlace) -> str:
+def _weakest(place: Place, nearby: float) -> str:
     """Compare a place with the best one nearby."""
-    model = place.scored.model
-    if model.found is None:
+    if place.refined is None:
         return "nothing could be compared"
-    return f"its roads explain 10^{_number(model.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
+    explained = place.agreement.log10_likelihood
+    return f"its roads explain 10^{_number(explained)}, those of a place nearby 10^{_number(nearby)}"

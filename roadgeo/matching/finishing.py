@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.geometry.camera import sampling
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import FEWEST
+from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import (
     Equations,
     Refined,
@@ -55,93 +54,91 @@ _NEAR_END, _FALL = 2.5, 0.3 / 0.5
 _LEAST_SLOPE = 0.17
 
 
-def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: float) -> None:
-    """Refine the best place of a map for the last time, and estimate the covariance of its corners.
+def measure_corners(estimator: TripleEstimator, best: Place) -> Place:
+    """Return the best place of a map refined for the last time, with the covariance of its corners.
 
-    A place is fitted to the whole frame only if its `score` may be reported: every part of a map has a best place.
+    A place is fitted to the whole frame only if its score may be reported: every part of a map has a best place.
     """
-    if best is None or best.refined is None or best.found is None or not estimator.options.lens:
-        return
+    if best.refined is None or not estimator.options.lens:
+        return best
     scene = estimator.scene
-    if best.refined.lens_k1 == 0.0:
-        doubtful = best.found.forward < _WHOLE and score > 0.0
+    if best.lens_k1 == 0.0:
+        doubtful = best.agreement.forward < _WHOLE and best.score > 0.0
         if doubtful:
-            _fit_whole_frame(estimator, best, best.refined, best.found.forward)
-        scene = _lay_between_carriageways(estimator, best, best.refined)
+            best = _fit_whole_frame(estimator, best)
+        best, scene = _fit_between_carriageways(estimator, best)
         for _ in range(_MOST_ROUNDS if doubtful else 0):
-            found = refine_beside(best.refined, scene, estimator.index, estimator.refinement(best))
-            if found is None or not estimator.may_be(found.matrix):
+            beside = refine_beside(best, scene, estimator.refinement(best))
+            if beside is None or not estimator.may_be(beside.matrix):
                 break
-            _take(estimator, best, found)
-    best.refined = with_honest_corners(best.refined, scene, estimator.index, estimator.refine_options)
+            best = _moved(best, beside)
+    return _with_corners(best, scene, estimator.refine_options)
 
 
-def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refined, agreeing: float) -> None:
-    """Refine a place that is found with all cells of the frame."""
+def _moved(place: Place, refined: Refined) -> Place:
+    """Return a place by a better fit; it keeps the likelihood by which it was compared."""
+    return place.at(refined).but(by=place.by)
+
+
+def _with_corners(place: Place, scene: Scene, options: RefineOptions) -> Place:
+    assert place.refined is not None  # noqa: S101 - what is measured was refined
+    return place.but(refined=with_honest_corners(place.refined, scene, place.index, options))
+
+
+def _fit_whole_frame(estimator: TripleEstimator, best: Place) -> Place:
+    """Refine a place with all cells of the frame, if about as much of the mask's roads agrees then."""
     options = replace(estimator.refinement(best), least_share=0.0)
-    found = refine(refined.matrix, estimator.scene, estimator.index, best.matched, options, held=True)
-    if found is not None and estimator.may_be(found.matrix):
-        _take(estimator, best, found, agreeing - _LEAST_LOST)
+    whole = refine(best.matrix, best.scene, best.index, best.matched, options, held=True)
+    if whole is None or not estimator.may_be(whole.matrix):
+        return best
+    moved = _moved(best, whole)
+    return moved if moved.agreement.forward >= best.agreement.forward - _LEAST_LOST else best
 
 
-def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> None:
-    """Take a new fit for a place, if at least this share of the mask's roads agrees.
-
-    The earlier agreement stays, for the score is based on it.
-    """
-    laid = best.lay(refined, estimator.scene, estimator.index)
-    if laid.found is not None and laid.found.forward >= least:
-        best.take(replace(laid, found=best.found, log10_likelihood=best.log10_likelihood))
-
-
-def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
-    """Fit the middle of a mask's two roads to the map's single road; return the scene with road points there."""
-    scene, index = estimator.scene, estimator.index
-    found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
-    if seen is scene or not estimator.may_be(found.matrix):
-        return scene
-    _take(estimator, best, found)
-    return seen
+def _fit_between_carriageways(estimator: TripleEstimator, best: Place) -> tuple[Place, Scene]:
+    """Fit the middle of a mask's two roads to the map's single road; return the scene with road points there, too."""
+    assert best.refined is not None  # noqa: S101 - what is measured was refined
+    between, scene = refine_between(best.refined, best.scene, best.index, best.matched, estimator.refinement(best))
+    if scene is best.scene or not estimator.may_be(between.matrix):
+        return best, best.scene
+    return _moved(best, between), scene
 
 
-def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined | None:
-    """Find a homography near a refined one that puts more road points on roads; None if there is no better one.
+def refine_beside(place: Place, scene: Scene, options: RefineOptions) -> Refined | None:
+    """Find a homography near a place's that puts more road points of a scene on roads; None if there is no better one.
 
     Each corner of the frame is moved in turn, while the others stay. A fit that does not come back may be better.
     """
-    options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
-    places, gsd = Homography(refined.matrix).everywhere(scene.corners), sampling(refined.matrix, scene.size)
-    step_m = max(_BESIDE_M, _BESIDE_PX * gsd)
+    options, nothing, index = replace(options, least_share=0.0), np.full(len(scene.intersections), -1), place.index
+    step_m = max(_BESIDE_M, _BESIDE_PX * place.gsd_m)
 
     def stays_away(fit: Refined) -> bool:
-        moved = np.hypot(*(Homography(fit.matrix).everywhere(scene.corners) - places).T)
+        moved = np.hypot(*(Homography(fit.matrix).everywhere(scene.corners) - place.corners).T)
         return bool(moved.max() > _BACK * step_m)
 
-    starts = _beside(refined.matrix, scene, step_m / gsd)
+    starts = _beside(place, step_m / place.gsd_m)
     tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
     weights = {weight_on_roads(fit.matrix, scene, index): fit for fit in tried if fit is not None and stays_away(fit)}
-    found = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None
-    needed = weight_on_roads(refined.matrix, scene, index) + _BETTER * len(scene.points)
-    return found if found is not None and weight_on_roads(found.matrix, scene, index) > needed else None
+    better = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None
+    needed = weight_on_roads(place.matrix, scene, index) + _BETTER * len(scene.points)
+    return better if better is not None and weight_on_roads(better.matrix, scene, index) > needed else None
 
 
-def _beside(matrix: FloatArray, scene: Scene, pixels: float) -> list[FloatArray]:
-    """Return homographies (3, 3) that move one corner of the frame, and map the others as `matrix` does.
+def _beside(place: Place, pixels: float) -> list[FloatArray]:
+    """Return homographies (3, 3) that move one corner of the frame, and map the others as a place does.
 
     The corner moves by this many pixels, but not by less ground than in the middle of the frame: distant ground of an
     oblique view may be off by more.
     """
-    corners, least_m = scene.corners.astype(np.float32), pixels * sampling(matrix, scene.size)
-    places, by_pixel = Homography(matrix).everywhere(scene.corners), Homography(matrix).jacobian(scene.corners)
-    middle = places.mean(axis=0)
-    back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
-    found = []
+    corners, least_m = place.scene.corners.astype(np.float32), pixels * place.gsd_m
+    by_pixel, middle = Homography(place.matrix).jacobian(place.scene.corners), place.corners.mean(axis=0)
+    back, beside = shift(*middle), list[FloatArray]()
     for k in range(4):
         for away in pixels * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]) @ by_pixel[k].T:
-            there = places - middle
+            there = place.corners - middle
             there[k] += away * max(1.0, least_m / float(np.hypot(*away)))
-            found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
-    return found
+            beside.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
+    return beside
 
 
 def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined:

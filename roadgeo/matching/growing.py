@@ -1,99 +1,41 @@
-"""Hypotheses: proposals are screened by the roads around them, and grown outwards, intersection by intersection."""
+"""Proposals are screened by the roads around them, and grown outwards, intersection by intersection."""
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Iterator, Sequence
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import CameraFault, CameraOptions, sampling
-from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo._arrays import BoolArray, IntArray
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
-from roadgeo.matching.evidence import Agreement, agreement, match_intersections
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.refinement import Refined
+from roadgeo.matching.place import Place
 from roadgeo.matching.road_search import PERSPECTIVE_SIGMA, Turnout
 from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import Proposals, Sweep
-
-if TYPE_CHECKING:
-    from roadgeo.matching.estimator import TripleEstimator
-
 
 __all__ = [
     "MAX_GROWN",
     "MAX_SCALE_RATIO",
     "MAX_SCREENED",
     "MAX_VERIFIED",
-    "Hypothesis",
+    "Member",
     "SharedSweeps",
     "grow_proposals",
     "screen_proposals",
 ]
 
 
-@dataclass
-class Hypothesis:
-    """A grown hypothesis and its results.
-
-    `by_roads`: it grew by roads over the whole frame; `log10_likelihood`: likelihood of the place (see `evidence`);
-    `nearby`: likelihood of the best place nearby, None before the search for it; `fault`: the camera's last objection.
-    """
-
-    matrix: FloatArray
-    support: float
-    matched: IntArray
-    refined: Refined | None = None
-    found: Agreement | None = None
-    log10_likelihood: float = -np.inf
-    nearby: float | None = None
-    distance: FloatArray | None = None
-    log10_odds: float = -np.inf
-    fault: CameraFault | None = None
-    by_roads: bool = False
-    _spot: tuple[float, float, float] | None = field(default=None, repr=False)
-
-    @classmethod
-    def at(cls, matrix: FloatArray, scene: Scene, index: ReferenceIndex, support: float = 1.0) -> Hypothesis:
-        """Make the hypothesis of a place that did not grow by intersections, with the intersections that match."""
-        return cls(matrix, support, match_intersections(matrix, scene, index)[0], by_roads=True)
-
-    def lay(self, refined: Refined, scene: Scene, index: ReferenceIndex) -> Hypothesis:
-        """Return the hypothesis with its refinement and its agreement on a scene without distortion."""
-        found, matched, distance = agreement(refined.matrix, scene, index)
-        return replace(
-            self, matrix=refined.matrix, refined=refined, found=found, matched=matched,
-            distance=distance, log10_likelihood=found.log10_likelihood, nearby=None, _spot=None,
-        )  # fmt: skip
-
-    def take(self, other: Hypothesis) -> None:
-        """Take over another variant of the same place."""
-        vars(self).update(vars(other))
-
-    def spot(self, size: tuple[int, int]) -> tuple[float, float, float]:
-        """Return x, y of the middle of a frame of this size, and the distance within which places are the same, metres.
-
-        The result is kept: in a lattice it is needed again and again.
-        """
-        if self._spot is None:
-            frame = Frame(*size)
-            x, y = Homography(self.matrix).everywhere(frame.plane_center).tolist()
-            self._spot = x, y, frame.one_place_m(sampling(self.matrix, size))
-        return self._spot
-
-
 #: Greatest factor between the ground sampling anywhere in a tilted frame and in its middle.
 MAX_SCALE_RATIO = 2.0
-#: Bounds of an anchor's work: proposals screened, proposals grown, and grown hypotheses scored.
+#: Bounds of an anchor's work: proposals screened, proposals grown, and grown places verified.
 MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
 #: Number of road points near the anchor, the share of them that must lie near roads, and the radius: the map's part in
 #: metres, and the mask's in pixels.
@@ -134,7 +76,7 @@ def grow_proposals(
     proposals: Proposals,
     chosen: IntArray,
     camera: CameraOptions,
-) -> list[Hypothesis]:
+) -> list[Place]:
     """Grow the chosen proposals of an anchor; return those that were not given up, the best supported first."""
     if len(chosen) == 0:
         return []
@@ -154,15 +96,32 @@ def grow_proposals(
         index.point_buckets, limits, _MIN_MATCHED, matched, matrices, ratios,
     )  # fmt: skip
     best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]  # others were given up
-    return [Hypothesis(matrices[m] / matrices[m, 2, 2], float(ratios[m]), matched[m]) for m in best]
+    return [Place(scene, index, matrices[m] / matrices[m, 2, 2], float(ratios[m]), False, matched[m]) for m in best]
 
 
-#: Whether hypotheses on two parts are the same place of a map that is cut into overlapping pieces.
-SamePlace: TypeAlias = "Callable[[TripleEstimator, Hypothesis, TripleEstimator, Hypothesis], bool]"
+class Member(Protocol):
+    """A part of a search, as the sweeps that it shares with others know it (see `estimator.Member`)."""
+
+    index: ReferenceIndex
+
+    def allow(self, proposals: Proposals) -> BoolArray:
+        """Return which proposals (M,) the hints allow."""
+
+    def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
+        """Return the proposals, of the `most` best placed, that put roads on roads."""
+
+    def follow_up(self, proposals: Proposals, chosen: IntArray) -> Iterator[Place]:
+        """Yield the different places that grow from the chosen proposals, the best supported first."""
+
+    def enough(self) -> bool:
+        """Return whether enough places were screened."""
+
+    def known_places(self) -> Sequence[Place]:
+        """Return the places that fit the whole frame."""
 
 
 #: The places that grew from an anchor's proposals and are not taken yet, by the identity of their part.
-_Grown: TypeAlias = "dict[int, list[Hypothesis]]"
+_Grown: TypeAlias = dict[int, list[Place]]
 
 
 class SharedSweeps:
@@ -178,17 +137,16 @@ class SharedSweeps:
         self,
         scene: Scene,
         camera: CameraOptions,
-        same_place: SamePlace | None = None,
         ahead: Ahead = ALONE,
     ) -> None:
-        """Begin without parts. `same_place` compares hypotheses on different parts."""
-        self.scene, self.camera, self.same_place, self.ahead = scene, camera, same_place, ahead
-        self.members: list[TripleEstimator] = []
+        """Begin without parts."""
+        self.scene, self.camera, self.ahead = scene, camera, ahead
+        self.members: list[Member] = []
         self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
         self._done: dict[int, list[_Grown]] = {}
         self._turnouts: dict[float, Turnout] = {}
 
-    def rounds(self, member: TripleEstimator, sweep: Sweep) -> Iterator[list[Hypothesis]]:
+    def rounds(self, member: Member, sweep: Sweep) -> Iterator[list[Place]]:
         """Yield the places that grew on a part from each anchor's proposals, until enough were screened."""
         rounds = self._rounds.setdefault(id(sweep), self._work(sweep))
         done = self._done.setdefault(id(sweep), [])
@@ -242,30 +200,24 @@ class SharedSweeps:
             if len(rows)
         ]
         # ... and the best of these are verified.
-        best: list[tuple[TripleEstimator, Hypothesis]] = []
-        for member, hypothesis in heapq.merge(*grown, key=lambda pair: -pair[1].support):
-            if not self._is_met(member, hypothesis, best):
-                best.append((member, hypothesis))
+        best: list[tuple[Member, Place]] = []
+        for member, place in heapq.merge(*grown, key=lambda pair: -pair[1].support):
+            if not self._is_met(place, best):
+                best.append((member, place))
                 if len(best) == MAX_VERIFIED:
                     break
         return {id(member): [place for owner, place in best if owner is member] for member, _ in best}
 
-    def _is_met(
-        self, member: TripleEstimator, hypothesis: Hypothesis, best: Sequence[tuple[TripleEstimator, Hypothesis]]
-    ) -> bool:
-        """Return whether another part that overlaps this one has the same place."""
-        if self.same_place is None:
-            return False
-        known = [(other, place) for other in self.members for place in other.known_places()]
-        return any(
-            other is not member and self.same_place(member, hypothesis, other, place)
-            for other, place in (*best, *known)
-        )
+    def _is_met(self, place: Place, best: Sequence[tuple[Member, Place]]) -> bool:
+        """Return whether another shard that overlaps this one has the same place."""
+        met = [*(other for _, other in best), *(other for member in self.members for other in member.known_places())]
+        beside = (other for other in met if other.index is not place.index and other.index.is_shard_beside(place.index))
+        return any(other.same(place) for other in beside)
 
 
-def _owned(member: TripleEstimator, grown: Iterator[Hypothesis]) -> Iterator[tuple[TripleEstimator, Hypothesis]]:
+def _owned(member: Member, grown: Iterator[Place]) -> Iterator[tuple[Member, Place]]:
     """Yield the places that grew, each with its part."""
-    return ((member, hypothesis) for hypothesis in grown)
+    return ((member, place) for place in grown)
 
 
 def _best(placed: Sequence[IntArray], most: int) -> IntArray:

@@ -134,6 +134,15 @@ class ReferenceIndex:
         """The reference's name for the user."""
         return str(self.meta.get("name", ""))
 
+    def is_of_map(self, other: ReferenceIndex) -> bool:
+        """Return whether both are the same map, or were cut from it (see `crop`): they have one plane."""
+        return self is other or self.meta is other.meta
+
+    def is_shard_beside(self, other: ReferenceIndex) -> bool:
+        """Return whether both are shards of one map: they agree where they overlap."""
+        shard_of = self.meta.get("shard_of")
+        return bool(shard_of) and shard_of == other.meta.get("shard_of")
+
     @property
     def plane(self) -> LocalPlane:
         """Where the index's plane lies on Earth."""

@@ -11,24 +11,21 @@ from typing import TypeAlias
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import sampling
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Events, Ledger
-from roadgeo.matching.evidence import agreement, statement_px
 from roadgeo.matching.finishing import measure_corners
-from roadgeo.matching.growing import Hypothesis, SharedSweeps
+from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
-from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.pairs import PairIndex, build_pair_index, well_fitted
 from roadgeo.matching.paper import PairOptions, match_pairs
-from roadgeo.matching.parts import Part, Whole, same_within_m
-from roadgeo.matching.picture import Picture
-from roadgeo.matching.rivals import Rivals, Standing
+from roadgeo.matching.parts import Part, Whole
+from roadgeo.matching.picture import by_picture
+from roadgeo.matching.place import Place, Weight
+from roadgeo.matching.rivals import Rivals
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Ahead, Search, search_together
@@ -36,7 +33,7 @@ from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
-__all__ = ["N_PLACES", "Fit", "Found", "Known", "search_references"]
+__all__ = ["N_PLACES", "Proposed", "Searched", "less_than", "search_references"]
 
 
 #: Limit of work for a first look at coarse maps, seconds.
@@ -46,58 +43,15 @@ N_PLACES = 5
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A place on a reference where the query fits. Dimension: N intersections of the query.
-
-    Attributes
-    ----------
-    index : ReferenceIndex
-        The reference, or the part of it that was searched.
-    matrix : (3, 3) float64
-        Query plane to reference plane.
-    matched, distance : (N,) int, (N,) float64
-        Intersection of `index` that matches each query intersection, or -1, and the distance between them, metres.
-    agreeing : float
-        Share of the query's roads that agree.
-    log10_odds : float
-        Lead of the place over any other; NaN if the method has no scores.
-    log10_likelihood, statement_px : float
-        See `evidence`.
-    corner_sigma_m, corner_covariance_m2, lens_k1
-        See `Refined`.
-    agreement : float
-        Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
-    """
-
-    index: ReferenceIndex
-    matrix: FloatArray
-    matched: IntArray
-    distance: FloatArray
-    agreeing: float = math.nan
-    log10_odds: float = math.nan
-    log10_likelihood: float = -math.inf
-    corner_sigma_m: FloatArray | None = None
-    corner_covariance_m2: FloatArray | None = None
-    lens_k1: float = 0.0
-    agreement: float = math.nan
-    statement_px: float = 1.0
-
-    @property
-    def explained(self) -> float:
-        """Likelihood, scaled so that places of different scale compare (see `evidence.statement_px`)."""
-        return self.log10_likelihood * self.statement_px
-
-
-@dataclass(frozen=True)
-class Found:
+class Searched:
     """The result of the search of one reference.
 
     Attributes
     ----------
     index : ReferenceIndex
         The whole reference.
-    fits : tuple of Fit
-        The likeliest place and its best rival, if they exist: the answer is based on them.
+    places : tuple of Place
+        The likeliest place, which is scored against its rival, and other verified ones, the best first.
     stopped : str
         As in `Search`; "" if no map was searched.
     said : str
@@ -105,12 +59,12 @@ class Found:
     n_searched, n_tried, n_anchors : int
         Intersections of the part of the reference that was searched, places screened, and intersections of the query
         that were looked up.
-    further : tuple of Fit
-        Other verified places, the best first: they are shown, no more.
+    estimator, search : TripleEstimator, Search or None
+        What searched, for explanation; None where nothing was to be searched, or by pairs.
     """
 
     index: ReferenceIndex
-    fits: tuple[Fit, ...] = ()
+    places: tuple[Place, ...] = ()
     stopped: str = ""
     said: str = ""
     n_searched: int = 0
@@ -120,18 +74,27 @@ class Found:
     match_s: float = 0.0
     refine_s: float = 0.0
     events: Events = field(default_factory=Events)
-    further: tuple[Fit, ...] = ()
+    estimator: TripleEstimator | None = None
+    search: Search[Place] | None = None
 
-    def less_likely(self, log10: float) -> Found:
+    @property
+    def compared(self) -> tuple[Place, ...]:
+        """The places that the answer rests on: the likeliest and its rival, as far as they exist."""
+        best = self.places[:1]
+        return (*best, *(place.rival for place in best if place.rival is not None))
+
+    def less_likely(self, log10: float) -> Searched:
         """Return the result with all places less likely by a number: they could have agreed by chance more often."""
-        fits, further = (
-            tuple(replace(fit, log10_odds=fit.log10_odds - log10) for fit in some) for some in (self.fits, self.further)
-        )
-        return replace(self, fits=fits, further=further)
+        return replace(self, places=tuple(_less_likely(place, log10) for place in self.places))
 
 
-#: A map, and a place on it, (3, 3), where a query is known to fit, or did once.
-Known: TypeAlias = tuple[ReferenceIndex, FloatArray]
+def _less_likely(place: Place, log10: float) -> Place:
+    rival = None if place.rival is None else place.rival.but(score=place.rival.score - log10)
+    return place.but(score=place.score - log10, rival=rival)
+
+
+#: A map, and a homography (3, 3) of a place on it that is to be verified first.
+Proposed: TypeAlias = tuple[ReferenceIndex, FloatArray]
 
 
 def search_references(
@@ -140,25 +103,25 @@ def search_references(
     options: LocateOptions,
     time_limit_s: float,
     explained: bool = False,
-    known: Sequence[Known] = (),
-) -> list[Found]:
+    proposed: Sequence[Proposed] = (),
+) -> list[Searched]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
     Parts that cannot contain the place are not opened, and have no result; if no part can, the first is opened. Coarse
     maps come first: if a place stands out on them, the others are not opened. Events are kept if the search is to be
-    `explained`. Places that are `known` are verified first.
+    `explained`. Places that were `proposed` before are verified first.
     """
     coarse, fine = _split(parts, options)
     with Ahead(options.threads) as ahead:
         if not coarse or not fine or options.method == "pair":
-            return _search(query, coarse + fine, options, time_limit_s, explained, ahead, known)
+            return _search(query, coarse + fine, options, time_limit_s, explained, ahead, proposed)
         started = time.perf_counter()
-        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead, known)
-        if any(one.stopped == "accepted" for one in found):
-            return found
+        first = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead, proposed)
+        if any(one.stopped == "accepted" for one in first):
+            return first
         spent_s = time.perf_counter() - started
-        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead, known)
-        return [replace(first, match_s=first.match_s + spent_s), *others]
+        begun, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead, proposed)
+        return [replace(begun, match_s=begun.match_s + spent_s), *others]
 
 
 def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], list[Part]]:
@@ -185,35 +148,35 @@ def _search(
     time_limit_s: float,
     explained: bool,
     ahead: Ahead,
-    known: Sequence[Known],
-) -> list[Found]:
+    proposed: Sequence[Proposed],
+) -> list[Searched]:
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     indexes = _open(parts, options, frame_m)
     if len(indexes) > 1:  # every search reads all tables, but few roads: those that masks before this one led to go
         let_pages_go(array for index in indexes for array in index.road_buckets[:3])
     if len(query.scene.intersections) == 0:
-        return [Found(index, events=Events(explained)) for index in indexes]
+        return [Searched(index, events=Events(explained)) for index in indexes]
     if options.method == "pair":
         return _search_pairs_in_turn(query, indexes, options, time_limit_s)
     started, ledger = time.perf_counter(), Ledger()
-    sweeps: SharedSweeps = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
+    sweeps = SharedSweeps(query.scene, options.match.camera, ahead)
     begun = [_begin(query, one, options, Events(explained), ledger, sweeps) for one in indexes]
-    for found, estimator in begun:
-        if estimator is not None and known:
-            here = (matrix for index, matrix in known if index is found.index)
-            estimator.known = [Hypothesis.at(matrix, query.scene, estimator.index) for matrix in here]
-    estimators = {Search(estimator): estimator for _, estimator in begun if estimator is not None}
-    ledger.n_reference = sum(found.n_searched for found, estimator in begun if estimator is not None)
+    for one in begun:
+        if one.estimator is not None and proposed:
+            here = (matrix for index, matrix in proposed if index is one.index)
+            one.estimator.proposed = [Place(query.scene, one.estimator.index, matrix) for matrix in here]
+    estimators = {Search(one.estimator): one.estimator for one in begun if one.estimator is not None}
+    ledger.n_reference = sum(one.n_searched for one in begun if one.estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
-    scale = larger(sum(found.n_searched for found, _ in begun))
+    scale = larger(sum(one.n_searched for one in begun))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    rivals = Rivals(estimators, ledger, options.min_log10_odds, left, _same_ground)
+    rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, rivals)
     sweeps.end()
     searches = iter(estimators)
-    return [found if one is None else _end(found, one, next(searches), rivals, scale) for found, one in begun]
+    return [one if one.estimator is None else _end(one, one.estimator, next(searches), rivals, scale) for one in begun]
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
@@ -228,21 +191,6 @@ def may_show(part: Part, options: LocateOptions, frame_m: float) -> bool:
     return (near is None or part.may_hold(near, frame_m)) and (within is None or part.touches(within))
 
 
-def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
-    """Return whether hypotheses on two parts are the same place."""
-    places = [
-        to_lonlat(estimator.index.plane.crs, estimator.index.plane.to_crs(estimator.center(model)[None]))[0]
-        for estimator, model in ((one, a), (other, b))
-    ]
-    return metres_apart(*places) <= same_within_m(one.index, other.index, b.matrix, other.scene.size)
-
-
-def _same_place(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
-    """Return whether hypotheses on two shards of a map are the same place."""
-    shard_of = one.index.meta.get("shard_of")
-    return bool(shard_of) and shard_of == other.index.meta.get("shard_of") and _same_ground(one, a, other, b)
-
-
 def _begin(
     query: Query,
     index: ReferenceIndex,
@@ -250,117 +198,67 @@ def _begin(
     events: Events,
     ledger: Ledger,
     sweeps: SharedSweeps,
-) -> tuple[Found, TripleEstimator | None]:
-    """Return a result without places, and the estimator, or None if the reference has no intersection near the hint."""
+) -> Searched:
+    """Return a result without places; it has an estimator, unless the reference has no intersection near the hint."""
     part, near, within = index, _near(index, options.near), options.match.within
     if within is not None and not Whole(index).touches(within):
-        return Found(index, events=events), None
+        return Searched(index, events=events)
     if near is not None:
         reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
         part = _part(index, near[:2], reach)
         if len(part) == 0:
-            return Found(index, events=events), None
+            return Searched(index, events=events)
     estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps, index)
-    return Found(index, n_searched=len(part), events=events), estimator
+    return Searched(index, n_searched=len(part), events=events, estimator=estimator)
 
 
-def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], rivals: Rivals, scale: float) -> Found:
+def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], rivals: Rivals, scale: float) -> Searched:
     """Return the result with its places; work is divided by `scale`, as on a map of usual size."""
-    standing = rivals.standing(search)
-    if found.events.kept:
-        found.events.result = search
-    fits = () if standing is None else _fits(estimator, standing)
-    further = () if standing is None else _further(estimator, standing, N_PLACES - len(fits))
-    if estimator.scene.probability is not None and fits:
-        fits, further = _by_picture(estimator, fits, further)
+    best = rivals.compare(search)
     work_ms = round(1000 * estimator.work / scale)
     counts = estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified
+    kept = begun.events.kept
     return replace(
-        found,
-        fits=fits,
-        further=further,
+        begun,
+        places=() if best is None or best.refined is None else _listed(estimator, best),
         stopped=search.stopped,
         n_tried=estimator.n_screened,
         n_anchors=estimator.n_anchors,
         stats=Stats(*counts, work_ms),
         match_s=search.seconds - estimator.refine_s,
         refine_s=estimator.refine_s,
+        estimator=estimator if kept else None,
+        search=search if kept else None,
     )
 
 
-def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
-    """Return the likeliest place and its best rival."""
-    model, lead = standing.model, standing.log10_lead
-    measure_corners(estimator, model, lead)
-    fits = [_fit(estimator, model, lead)]
-    if standing.rival is not None:
-        fits.append(_fit_of_rival(estimator, standing.rival, min(-lead, 0.0), standing.rival_likelihood))
-    counted_px = statement_px(sampling(model.matrix, estimator.scene.size))
-    return tuple(replace(fit, statement_px=counted_px) for fit in fits if fit is not None)
+def _listed(estimator: TripleEstimator, best: Place) -> tuple[Place, ...]:
+    """Return the likeliest place, its corners measured, and others that were verified; all by one yardstick.
 
-
-def _further(estimator: TripleEstimator, standing: Standing, most: int) -> tuple[Fit, ...]:
-    """Return the likeliest verified places besides the two that the answer rests on."""
-    likeliest, lead = standing.model, min(-standing.log10_lead, 0.0)
-    known = [likeliest]
-    if standing.rival is not None:
-        known.append(Hypothesis.at(standing.rival, estimator.scene, estimator.index))
-    counted_px = statement_px(sampling(likeliest.matrix, estimator.scene.size))
-    further: list[Fit] = []
-    for model in sorted(estimator.verified, key=lambda model: -model.log10_likelihood):
-        if len(further) == most:
+    Likelihoods are those by the picture where there is a soft one, so that places on several maps compare by it. Other
+    places score what they explain less than the best, but no more than the best leads.
+    """
+    counted_px = best.statement_px
+    best = measure_corners(estimator, best.but(by=Weight(best.log10_likelihood, counted_px)))
+    rival, others, met = best.rival, list[Place](), [best, *filter(None, [best.rival])]
+    for place in sorted(estimator.verified, key=lambda place: -place.log10_likelihood):
+        if len(met) + len(others) == N_PLACES:
             break
-        if any(estimator.same(model, other) for other in known):
-            continue
-        known.append(model)
-        fit = _fit(estimator, model, min(model.log10_likelihood - likeliest.log10_likelihood, lead))
-        if fit is not None:  # how far its corners may be off was not measured
-            further.append(replace(fit, corner_sigma_m=None, corner_covariance_m2=None, statement_px=counted_px))
-    return tuple(further)
+        if place.refined is not None and not any(place.same(other) for other in (*met, *others)):
+            others.append(place.but(by=Weight(place.log10_likelihood, counted_px)))
+    if estimator.scene.probability is not None:
+        best, *others = (by_picture(place, best.gsd_m) for place in [best, *others])
+        rival = rival and by_picture(rival, best.gsd_m)
+    if rival is not None:
+        behind = 0.0 if estimator.scene.probability is None else rival.log10_likelihood - best.log10_likelihood
+        rival = rival.but(score=min(behind, -best.score, 0.0))
+    others = [less_than(best, place) for place in others]
+    return best.but(rival=rival), *others
 
 
-def _by_picture(
-    estimator: TripleEstimator, fits: Sequence[Fit], further: Sequence[Fit]
-) -> tuple[tuple[Fit, ...], tuple[Fit, ...]]:
-    """Return places with their likelihoods by the picture, so that places on several maps compare by it."""
-    scene = estimator.scene
-    gsd_m, lead = sampling(fits[0].matrix, scene.size), min(-fits[0].log10_odds, 0.0)
-
-    def weigh(fit: Fit) -> Fit:
-        straight = straighten_scene(scene, fit.lens_k1) if fit.lens_k1 else scene
-        picture = Picture(straight, estimator.index, gsd_m)
-        return replace(fit, log10_likelihood=picture.weigh(fit.matrix), statement_px=picture.statement_px)
-
-    best, *others = map(weigh, (*fits, *further))
-    others = [replace(fit, log10_odds=min(fit.log10_likelihood - best.log10_likelihood, lead)) for fit in others]
-    return (best, *others[: len(fits) - 1]), tuple(others[len(fits) - 1 :])
-
-
-def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | None:
-    """Return a place that was verified."""
-    if model.refined is None or model.found is None or model.distance is None:
-        return None
-    found, refined = model.found, model.refined
-    return Fit(
-        estimator.index,
-        refined.matrix,
-        model.matched,
-        model.distance,
-        found.forward,
-        lead,
-        model.log10_likelihood,
-        refined.corner_sigma_m,
-        refined.corner_covariance_m2,
-        refined.lens_k1,
-        found.mean,
-    )
-
-
-def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, likelihood: float) -> Fit:
-    """Return the best rival as a fit."""
-    scene, index = estimator.scene, estimator.index
-    found, matched, distance = agreement(matrix, scene, index)
-    return Fit(index, matrix, matched, distance, found.forward, lead, likelihood, agreement=found.mean)
+def less_than(best: Place, place: Place) -> Place:
+    """Return a place with its score against the best: what it explains less, but no more than the best leads."""
+    return place.but(score=min(place.log10_likelihood - best.log10_likelihood, -best.score, 0.0))
 
 
 def _of_effort(options: LocateOptions) -> MatchOptions:
@@ -394,25 +292,25 @@ def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -
 
 def _search_pairs_in_turn(
     query: Query, indexes: Sequence[ReferenceIndex], options: LocateOptions, time_s: float
-) -> list[Found]:
+) -> list[Searched]:
     """Search the references in turn; each gets an even share of the work and the time that are left."""
-    found: list[Found] = []
+    searched: list[Searched] = []
     pair = options.pair
     work_s, time_s = min(pair.work_limit_s, options.search.work_limit_s), min(pair.time_limit_s, time_s)
     for n_left in range(len(indexes), 0, -1):
         share = replace(pair, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
         one = _search_pairs(query, indexes[-n_left], share)
         work_s, time_s = max(work_s - one.stats.work_ms / 1000, 0.0), max(time_s - one.match_s, 0.0)
-        found.append(one)
-    return found
+        searched.append(one)
+    return searched
 
 
-def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> Found:
+def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> Searched:
     """Run the paper's method; its places have no scores."""
     scene = query.scene
     table = _pair_index(index, options.d_max_m)
     match = match_pairs(scene.intersections, table, scene.corners, options)
-    found = Found(
+    searched = Searched(
         index,
         stopped=match.stopped,
         said=match.reason,
@@ -421,14 +319,10 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> 
         match_s=match.seconds,
     )
     if match.homography is None:
-        return found
+        return searched
     matched = np.full(len(scene.intersections), -1, np.int64)
     matched[match.matches[:, 0]] = table.reference.node[match.matches[:, 1]]
-    chosen = matched >= 0
-    gap = Homography(match.homography)(scene.intersections.xy[chosen]) - index.xy[matched[chosen]]
-    distance = np.zeros(len(matched))
-    distance[chosen] = np.hypot(*gap.T)
-    return replace(found, fits=(Fit(index, match.homography, matched, distance),))
+    return replace(searched, places=(Place(scene, index, match.homography, grown=matched, score=math.nan),))
 
 
 @lru_cache(maxsize=4)

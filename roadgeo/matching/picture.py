@@ -28,10 +28,11 @@ from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.shifts import Shift, move_about, shifted
 
-__all__ = ["Peak", "Picture"]
+__all__ = ["Picture", "by_picture"]
 
 #: Grid of the marginalised shares: of the map's roads that are missing, and the density of false roads.
 _MISSING = np.array([0.05, 0.15, 0.3, 0.5, 0.75])
@@ -59,14 +60,6 @@ _MOST_CELLS = 1100
 _GSD_STEP = 1.05
 #: Steps by which a place is moved, cells.
 _STEPS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-
-
-class Peak(NamedTuple):
-    """A place (3, 3) where the picture agrees with the map, and its log10 likelihood."""
-
-    worth: float
-    matrix: FloatArray
-    turn_deg: float = 0.0
 
 
 class Ground(NamedTuple):
@@ -128,23 +121,28 @@ class Picture:
         """
         return (worth - max(rival, 0.0)) * min(1.0, _MOST_WORTH / max(worth, 1e-9))
 
-    def settle(self, peak: Peak) -> Peak:
-        """Move a place found on coarse cells by steps of a fine cell to where it is likeliest."""
-        cell_m = self._fine_cell_m(peak.matrix)
-        ground = self._around(peak.matrix, cell_m, 5.0 * cell_m)
-        best = Peak(self.weigh(peak.matrix, ground), peak.matrix, peak.turn_deg)
+    def place(self, matrix: FloatArray, log10_likelihood: float) -> Place:
+        """Return a place by its homography (3, 3), with its likelihood by the picture."""
+        return Place(self.scene, self.index, matrix, by=Weight(log10_likelihood, self.statement_px))
+
+    def settle(self, place: Place) -> Place:
+        """Return a place found on coarse cells moved by steps of a fine cell to where it is likeliest."""
+        cell_m = self._fine_cell_m(place.matrix)
+        ground = self._around(place.matrix, cell_m, 5.0 * cell_m)
+        best = self.place(place.matrix, self.weigh(place.matrix, ground))
         for _ in range(4):
             moved = [shifted(best.matrix, *step) for step in cell_m * _STEPS]
-            better = max((Peak(self.weigh(m, ground), m, peak.turn_deg) for m in moved), key=lambda peak: peak.worth)
-            if better.worth <= best.worth:
+            places = (self.place(matrix, self.weigh(matrix, ground)) for matrix in moved)
+            better = max(places, key=lambda place: place.log10_likelihood)
+            if better.log10_likelihood <= best.log10_likelihood:
                 break
             best = better
         return best
 
     def correlate(
         self, matrix: FloatArray, reach_m: float, turns_deg: Sequence[float], most: int, apart_m: float
-    ) -> list[Peak]:
-        """Return places around a place where the picture correlates with the map, the best first.
+    ) -> list[Place]:
+        """Return other places around a place where the picture correlates with the map, the best first.
 
         Parameters
         ----------
@@ -157,7 +155,7 @@ class Picture:
         most : int
             Number of places for each turn.
         apart_m : float
-            Least distance between two places of a turn.
+            Least distance between two places of a turn, and from the place itself.
         """
         scene, gsd_m = self.scene, sampling(matrix, self.scene.size)
         missing, false = divmod(int(self._nats(matrix).argmax()), len(_FALSE))
@@ -169,7 +167,7 @@ class Picture:
         ground = draw_roads(self.index, low, low + (side - 0.5) * cell_m, cell_m)
         spectrum = cv2.dft(ground.roads)
         unit = _length_px(cell_m, gsd_m) / self.statement_px / math.log(10.0)
-        found: list[Peak] = []
+        places: list[Place] = []
         reach, apart = int(reach_m / cell_m), max(int(apart_m / cell_m), 1)
         for turn_deg in turns_deg:
             turned = move_about(center, Shift(0.0, 0.0, turn_deg, 1.0, 0.0)) @ matrix
@@ -187,9 +185,10 @@ class Picture:
             rows, columns = np.nonzero(peaks)
             order = np.argsort(-near[rows, columns])[:most]
             for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
-                moved = shifted(turned, (c + left - column) * cell_m, (r + top - row) * cell_m)
-                found.append(Peak(float(near[r, c]) * unit, moved, turn_deg))
-        return sorted(found, key=lambda peak: -peak.worth)
+                east_m, north_m = (c + left - column) * cell_m, (r + top - row) * cell_m
+                if turn_deg != 0.0 or math.hypot(east_m, north_m) >= apart_m:
+                    places.append(self.place(shifted(turned, east_m, north_m), float(near[r, c]) * unit))
+        return sorted(places, key=lambda place: -place.log10_likelihood)
 
     def _fine_cell_m(self, matrix: FloatArray) -> float:
         """Return the cells by which a place is weighed, metres, no finer than the reduced frame's."""
@@ -222,6 +221,12 @@ class Picture:
             levels.cells, warp, (int(columns), int(rows)), flags=cv2.INTER_LINEAR, borderValue=levels.neutral
         )
         return levels, template, (int(low[0]), int(low[1]))
+
+
+def by_picture(place: Place, gsd_m: float) -> Place:
+    """Return a place with its likelihood by its scene's picture, at these metres per pixel."""
+    picture = Picture(place.scene, place.index, gsd_m)
+    return place.but(by=Weight(picture.weigh(place.matrix), picture.statement_px))
 
 
 @lru_cache(maxsize=16)

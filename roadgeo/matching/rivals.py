@@ -19,26 +19,23 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.geometry.camera import CameraFault, judge, sampling
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.camera import CameraFault, judge
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.evidence import Evidence, match_intersections, statement_px
-from roadgeo.matching.growing import Hypothesis, SamePlace
-from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.picture import Peak, Picture
+from roadgeo.matching.picture import Picture, by_picture
+from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import refine
-from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["Other", "Rivals", "Standing", "log10_gap", "similar_places"]
+__all__ = ["Compared", "Rivals", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -54,7 +51,7 @@ _MOST_TURNS = 12
 _CERTAIN, _DOUBTED, _REPEATING = 12.0, 1.0, 0.5
 #: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
 #: that part is up to a tenth, at right places nine tenths and more.
-_WORTH_LOOKING = 0.5
+_MAY_LEAD = 0.5
 #: Score that a place loses if all its roads are contradicted, and in proportion (see `Evidence.contradicted`). At right
 #: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
 #: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
@@ -63,7 +60,7 @@ _DOUBT = 60.0
 #: refinement of places around.
 _N_KNOWN, _N_POINTS = 12, 200
 #: Number of the likeliest places around that are fully refined.
-_N_LAID = 8
+_N_FITTED = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
@@ -81,31 +78,18 @@ _AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=2
 _NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
 
 
-class Standing(NamedTuple):
-    """A place, its best rival (3, 3) if it has any, and its lead over the rival (log10).
+class Compared(NamedTuple):
+    """Another place, its log10 likelihood by the best place's yardstick, the lead over it, and the score against it."""
 
-    `log10_likelihood`, `rival_likelihood`: the log10 likelihood of each, at the same metres per pixel.
-    """
-
-    model: Hypothesis
-    rival: FloatArray | None
-    log10_lead: float
-    log10_likelihood: float = -math.inf
-    rival_likelihood: float = -math.inf
+    place: Place
+    log10_likelihood: float
+    lead: float
+    against: float = 0.0
 
     @property
-    def is_beaten(self) -> bool:
-        """Return whether the rival explains more."""
-        return self.rival is not None and self.rival_likelihood > self.log10_likelihood
-
-
-class Other(NamedTuple):
-    """Another place: its log10 likelihood, the lead over it, its homography (3, 3), and the score against it."""
-
-    worth: float
-    lead: float
-    matrix: FloatArray
-    against: float = 0.0
+    def net(self) -> float:
+        """Log10 likelihood, less the score against it."""
+        return self.log10_likelihood - self.against
 
 
 class Rivals:
@@ -113,240 +97,211 @@ class Rivals:
 
     def __init__(
         self,
-        estimators: Mapping[Search[Hypothesis], TripleEstimator],
+        estimators: Mapping[Search[Place], TripleEstimator],
         ledger: Ledger,
         needed: float,
         time_limit_s: float = math.inf,
-        same: SamePlace = lambda *_: False,
     ) -> None:
-        """Places with a score below `needed` are not compared; no place is compared after the time limit.
-
-        `same` returns whether places of two parts, which may overlap, are the same.
-        """
-        self.estimators, self.ledger, self.needed, self._same = estimators, ledger, needed, same
+        """Places with a score below `needed` are not compared; no place is compared after the time limit."""
+        self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
-        # by the ids of the place and of those that were met, which are not reused while a standing exists
-        self._known: dict[tuple[int, ...], Standing] = {}
-        self._doubts: dict[int, tuple[FloatArray, float]] = {}  # with the matrix as it was then
+        self._compared: dict[tuple[Place, ...], Place] = {}  # by the place and those that were met
 
-    def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
+    def __call__(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
         """Return the part whose likeliest place leads all others by twice the score needed, or None."""
         best = max(parts, key=self._explained)
-        if max((model.log10_odds for model in self.estimators[best].verified), default=-math.inf) < self.needed:
+        if max((place.score for place in self.estimators[best].verified), default=-math.inf) < self.needed:
             return None  # a place that was met is already too good a rival
-        standing = self._by_roads(best)
-        if standing is None or standing.log10_lead < 2.0 * self.needed:
+        place = self._by_roads(best)
+        if place is None or place.score < 2.0 * self.needed:
             return None
-        return None if any(self._rivals(part, best, standing.model) for part in parts) else best
+        return None if any(self._rivals(part, place) for part in parts if part is not best) else best
 
-    def _rivals(self, part: Search[Hypothesis], best: Search[Hypothesis], model: Hypothesis) -> bool:
+    def _rivals(self, part: Search[Place], best: Place) -> bool:
         """Return whether another part has another place that explains nearly as much as the best place of all."""
-        here, there = self.estimators[best], self.estimators[part]
-        least = here.explained(model) - self.needed * statement_px(sampling(model.matrix, here.scene.size))
-        return part is not best and any(
-            there.explained(other) > least and not self._same(here, model, there, other) for other in there.verified
-        )
+        least = best.explained - self.needed * best.statement_px
+        return any(other.explained > least and not other.same(best) for other in self.estimators[part].verified)
 
-    def _explained(self, part: Search[Hypothesis]) -> float:
-        estimator = self.estimators[part]
-        return max(map(estimator.explained, estimator.verified), default=-math.inf)
+    def _explained(self, part: Search[Place]) -> float:
+        return max((place.explained for place in self.estimators[part].verified), default=-math.inf)
 
-    def standing(self, part: Search[Hypothesis]) -> Standing | None:
-        """Compare the likeliest place of a part with its best rival; return None if no place was verified."""
+    def compare(self, part: Search[Place]) -> Place | None:
+        """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
         by_roads, estimator = self._by_roads(part), self.estimators[part]
         is_soft = estimator.scene.probability is not None
-        may_decide = (is_soft or estimator.anywhere is not None) and time.perf_counter() <= self._deadline
-        if by_roads is None or by_roads.log10_lead >= _CERTAIN or not may_decide:
+        may_decide = (is_soft or estimator.unrestricted is not None) and time.perf_counter() <= self._deadline
+        if by_roads is None or by_roads.score >= _CERTAIN or not may_decide:
             return by_roads
         started = time.perf_counter()
-        seen = self._by_picture(estimator)
+        by_picture = self._by_picture(estimator)
         part.seconds += time.perf_counter() - started
-        best, other = sorted((by_roads, seen), key=lambda standing: -standing.log10_lead)
-        is_same, lesser = estimator.same(best.model, other.model), max(other.log10_lead, 0.0)
-        if (
-            best is seen and best.rival is not None and not is_soft
-        ):  # likelihoods of drawn masks are those of their roads
-            scene, gsd_m = estimator.scene_of(best.model), sampling(best.model.matrix, estimator.scene.size)
-            best = best._replace(rival_likelihood=Evidence(scene, estimator.index, gsd_m).weigh(best.rival))
-        return best._replace(log10_lead=best.log10_lead + (_AGREEING * is_soft if is_same else -1.0) * lesser)
+        best, other = sorted((by_roads, by_picture), key=lambda place: -place.score)
+        is_same, lesser = best.same(other), max(other.score, 0.0)
+        if best is by_picture and not is_soft:  # likelihoods of drawn masks are those of their roads
+            rival, counted_px = best.rival, best.but(by=None).statement_px
+            if rival is not None:
+                rival = rival.but(by=Weight(best.evidence.weigh(rival.matrix), counted_px))
+            best = best.but(by=None, rival=rival)
+        return best.but(score=best.score + (_AGREEING * is_soft if is_same else -1.0) * lesser)
 
     @property
     def _by_chance(self) -> float:
         """Score that a place loses: the larger the map, the more places may lead all places around them by chance."""
         return 2.0 * math.log10(larger(self.ledger.n_reference))
 
-    def _by_picture(self, estimator: TripleEstimator) -> Standing:
+    def _by_picture(self, estimator: TripleEstimator) -> Place:
         """Compare the place that the picture favours with its best rival."""
-        ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)[:_N_KNOWN]
-        gsd_m = sampling(ranked[0].matrix, estimator.scene.size)
-        best = max(ranked, key=lambda model: estimator.picture(model, gsd_m).weigh(model.matrix))
+        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:_N_KNOWN]
+        gsd_m = ranked[0].gsd_m
+        best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
         for _ in range(_MOST_TURNS):
-            estimator.refine_whole(best)
-            standing = self._seen(estimator, best, ranked)
-            if standing.rival is None or not standing.is_beaten:
+            compared = self._compare_by_picture(estimator, estimator.refine_whole(best), ranked)
+            if not _is_beaten(compared):
                 break
-            best = self._take(estimator, standing.rival, ranked)
-        if estimator.anywhere is None or standing.is_beaten:
-            return standing
-        free = self._seen(estimator.anywhere, standing.model, ranked)  # see `_compare`
-        return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
+            best = self._take(estimator, compared.rival, ranked)
+        if estimator.unrestricted is None or _is_beaten(compared):
+            return compared
+        free = self._compare_by_picture(estimator.unrestricted, compared, ranked)  # see `_compare`
+        return compared.but(score=max(compared.score, free.score))
 
-    def _seen(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
+    def _compare_by_picture(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
         """Compare a place with those that were met, and with those around, by the picture."""
-        picture = estimator.picture(best, sampling(best.matrix, estimator.scene.size))
-        apart_m, middle = max(_BESIDE_M, _BESIDE_PX * picture.gsd_m), estimator.center(best)
+        picture = Picture(best.scene, best.index, best.gsd_m)
+        apart_m = max(_BESIDE_M, _BESIDE_PX * picture.gsd_m)
         others = [
-            Peak(estimator.picture(model, picture.gsd_m).weigh(model.matrix), model.matrix)
-            for model in ranked
-            if math.dist(estimator.center(model), middle) > apart_m
+            by_picture(place, picture.gsd_m) for place in ranked if math.dist(place.center, best.center) > apart_m
         ]
-        worth, lead, rival = picture.weigh(best.matrix), math.inf, None
+        likelihood, lead, rival = picture.weigh(best.matrix), math.inf, None
         for reach_m in _REACHES_M:
-            others += _around(picture, best.matrix, reach_m, apart_m, estimator)
-            rival = max(others, key=lambda other: other.worth, default=None)
-            likelihood = -math.inf if rival is None else rival.worth
-            lead = picture.lead(worth, likelihood)
-            if not _WORTH_LOOKING * self.needed <= lead < 2.0 * self.needed:
+            others += _around(picture, best, reach_m, apart_m, estimator)
+            rival = max(others, key=lambda other: other.log10_likelihood, default=None)
+            lead = picture.lead(likelihood, -math.inf if rival is None else rival.log10_likelihood)
+            if not _MAY_LEAD * self.needed <= lead < 2.0 * self.needed:
                 break
-        lead = max(lead - self.doubt(estimator, best), 0.0) - self._by_chance
-        return Standing(best, None if rival is None else rival.matrix, lead, worth, likelihood)
+        score = max(lead - _penalty(best), 0.0) - self._by_chance
+        return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
 
-    def _by_roads(self, part: Search[Hypothesis]) -> Standing | None:
+    def _by_roads(self, part: Search[Place]) -> Place | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""
         estimator = self.estimators[part]
-        ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)
+        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[:_N_KNOWN], key=lambda model: model.log10_likelihood - self.doubt(estimator, model))
+        best = max(ranked[:_N_KNOWN], key=lambda place: place.log10_likelihood - _penalty(place))
         for _ in range(_MOST_TURNS):
-            key = id(best), *map(id, ranked[: 1 + _N_KNOWN])
-            standing = self._known.get(key) or self._compare(estimator, best, ranked)
-            self._known[key] = standing
-            if standing.rival is None or not standing.is_beaten:
+            key = best, *ranked[: 1 + _N_KNOWN]
+            compared = self._compared.get(key) or self._compare(estimator, best, ranked)
+            self._compared[key] = compared
+            if not _is_beaten(compared):
                 break
-            best = self._take(estimator, standing.rival, ranked)
+            best = self._take(estimator, compared.rival, ranked)
         part.seconds += time.perf_counter() - started
-        return standing
+        return compared
 
-    def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
+    def _compare(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
         """Compare a place with its rivals, and with those that hints exclude where it leads these too by more.
 
         Hints leave few rivals, by which a gap is hard to judge: without them a place would lead by less.
         """
-        standing, anywhere = self._compare_allowed(estimator, best, ranked), estimator.anywhere
-        if anywhere is None or standing.is_beaten or standing.log10_lead >= _CERTAIN:
-            return standing
-        free = self._compare_allowed(anywhere, best, ranked)
-        return standing._replace(log10_lead=max(standing.log10_lead, free.log10_lead))
+        compared, unrestricted = self._compare_allowed(estimator, best, ranked), estimator.unrestricted
+        if unrestricted is None or _is_beaten(compared) or compared.score >= _CERTAIN:
+            return compared
+        free = self._compare_allowed(unrestricted, best, ranked)
+        return compared.but(score=max(compared.score, free.score))
 
-    def _compare_allowed(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
-        scene, matrix = estimator.scene_of(best), best.matrix
-        if best.log10_likelihood < self.needed:
-            return Standing(best, None, best.log10_odds)
-        doubt = self.doubt(estimator, best)
-        likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
-        odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
-        most = _REPEATING * best.log10_likelihood
-        if odds >= _CERTAIN and doubt < _DOUBTED and max(likeliest, estimator.nearby(best)) < most:
-            return Standing(best, None, odds - doubt, best.log10_likelihood)
+    def _compare_allowed(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
+        gave_up = best.refined is None and not math.isfinite(best.score)
+        if gave_up or best.log10_likelihood < self.needed:
+            return best.but(rival=None)
+        penalty, worth = _penalty(best), best.log10_likelihood
+        likeliest = next((other.log10_likelihood for other in ranked if not other.same(best)), 0.0)
+        lead = min(best.score, worth - max(likeliest, 0.0))
+        if lead >= _CERTAIN and penalty < _DOUBTED and max(likeliest, estimator.nearby(best)) < _REPEATING * worth:
+            return best.but(score=lead - penalty, rival=None)
         if time.perf_counter() > self._deadline:
-            return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
-        evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
-        worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
-        apart_m, compare = _APART * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
-        against = self._by_chance + doubt
+            return best.but(score=min(lead, 0.0), rival=None)
+        apart_m, compare = _APART * best.scene.half_size * best.gsd_m, best.evidence.compared_with(best.matrix)
+        against = self._by_chance + penalty
 
-        def is_rival(other: Other) -> bool:
+        def is_rival(other: Compared) -> bool:
             return bool(
-                np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
-                and estimator.may_be(other.matrix)
-                and (other.worth - other.against > worth or evidence.shared(matrix, other.matrix) < _SAME)
+                math.dist(other.place.center, best.center) > apart_m
+                and estimator.may_be(other.place.matrix)
+                and (other.net > worth or best.evidence.shared(best.matrix, other.place.matrix) < _SAME)
             )
 
-        def stand(others: Sequence[Other]) -> Standing:
-            rival = max(others, key=lambda other: other.worth - other.against, default=None)
+        def scored(others: Sequence[Compared]) -> Place:
+            rival = max(others, key=lambda other: other.net, default=None)
             lead = min((other.lead for other in others), default=math.inf)
-            lead += log10_gap(worth, [other.worth for other in others])
+            lead += log10_gap(worth, [other.log10_likelihood for other in others])
             if rival is None:
-                return Standing(best, None, min(lead, worth) - against, worth)
-            likelihood = rival.worth - rival.against
-            odds = worth - likelihood if likelihood > worth else min(lead, worth) - against
-            return Standing(best, rival.matrix, odds, worth, likelihood)
+                return best.but(score=min(lead, worth) - against, rival=None)
+            score = worth - rival.net if rival.net > worth else min(lead, worth) - against
+            return best.but(score=score, rival=rival.place.but(by=Weight(rival.net, best.statement_px)))
 
-        known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
-        met = (Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known)
+        others = [place for place in ranked[: 1 + _N_KNOWN] if place is not best]
+        met = (Compared(place, *compare(place.matrix), _penalty(place)) for place in others)
         rivals = list(filter(is_rival, met))
-        standing = stand(rivals)
-        leads = standing.log10_lead >= _WORTH_LOOKING * self.needed
+        compared = scored(rivals)
+        leads = compared.score >= _MAY_LEAD * self.needed
         if not leads and estimator.nearby(best) < _REPEATING * worth:
-            return standing
+            return compared
         for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
-            rivals += filter(is_rival, similar_places(matrix, evidence, compare, estimator.options, around))
-            standing = stand(rivals)
-            if standing.is_beaten or standing.log10_lead >= _CERTAIN:
+            rivals += filter(is_rival, similar_places(best, compare, estimator.options, around))
+            compared = scored(rivals)
+            if _is_beaten(compared) or compared.score >= _CERTAIN:
                 break
-        return standing
+        return compared
 
-    def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
-        """Return the score against a place for the roads that it contradicts; computed once for each matrix."""
-        known, matrix = self._doubts.get(id(model)), model.matrix
-        if known is None or known[0] is not matrix:
-            scene = estimator.scene_of(model)
-            evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
-            known = self._doubts[id(model)] = matrix, _DOUBT * evidence.contradicted(matrix)
-        return known[1]
-
-    def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the hypothesis of a rival that explains more than the likeliest place: a known one, or a new one."""
-        known = next((model for model in ranked if model.matrix is matrix), None)
-        if known is not None:
-            return known
-        model = Hypothesis.at(matrix, estimator.scene, estimator.index)
-        estimator.score(model)
-        return model
+    def _take(self, estimator: TripleEstimator, rival: Place | None, ranked: Sequence[Place]) -> Place:
+        """Return the rival that explains more than the likeliest place, as it was verified; now, if it was not yet."""
+        matrix = rival.matrix  # type: ignore[union-attr]
+        known = next((place for place in ranked if place.matrix is matrix), None)
+        return known or estimator.settle(Place(estimator.scene, estimator.index, matrix))[0]
 
 
-def _around(
-    picture: Picture, matrix: FloatArray, reach_m: float, apart_m: float, estimator: TripleEstimator
-) -> list[Peak]:
-    """Return the likeliest other places around a place (3, 3), shifted or turned, that agree with the hints."""
-    center = Homography(matrix).everywhere(picture.scene.center)
+def _is_beaten(place: Place) -> bool:
+    """Return whether a place's rival explains more."""
+    return place.rival is not None and place.rival.log10_likelihood > place.log10_likelihood
+
+
+def _penalty(place: Place) -> float:
+    """Return the score that a place loses for the roads that it contradicts."""
+    return _DOUBT * place.contradicted
+
+
+def _around(picture: Picture, best: Place, reach_m: float, apart_m: float, estimator: TripleEstimator) -> list[Place]:
+    """Return the likeliest other places around a place, shifted or turned, that agree with the hints."""
     if estimator.near is not None:
         reach_m = min(reach_m, 2.0 * estimator.near[2])
-    found: list[Peak] = []
-    for peak in picture.correlate(matrix, reach_m, _TURNS_DEG, _PEAKS, apart_m):
-        away_m = np.hypot(*(Homography(peak.matrix).everywhere(picture.scene.center) - center))
-        if (peak.turn_deg != 0.0 or away_m > apart_m) and estimator.may_be(peak.matrix):
-            found.append(picture.settle(peak))
-        if len(found) == _WEIGHED:
-            break
-    return found
+    peaks = picture.correlate(best.matrix, reach_m, _TURNS_DEG, _PEAKS, apart_m)
+    allowed = (place for place in peaks if estimator.may_be(place.matrix))
+    return [picture.settle(place) for place in islice(allowed, _WEIGHED)]
 
 
 def similar_places(
-    matrix: FloatArray,
-    evidence: Evidence,
+    best: Place,
     compare: Callable[[FloatArray], tuple[float, float]],
     match: MatchOptions,
     around: LocalSearchOptions = _AROUND,
-) -> list[Other]:
+) -> list[Compared]:
     """Return other places around a place that fit most roads; the likeliest are fully refined."""
-    scene, index = evidence.scene, evidence.index
-    center = Homography(matrix).everywhere(scene.center)
+    scene, index = best.scene, best.index
     drawn: Drawn = {}
-    found: list[tuple[float, FloatArray]] = []
+    proposed: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
-        turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
+        turned = move_about(best.center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ best.matrix
         if judge(turned, scene.size, match.camera) is CameraFault.HEADING:
             continue
         shifts = search_nearby(turned, scene, index, around, drawn)
-        found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
-    found.sort(key=lambda place: -place[0])
-    fits = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])
-    roughly = sorted((Other(*compare(fit), fit) for fit in fits), key=lambda other: -other.worth)
-    finely = (_lay(other.matrix, scene, index, match, None) for other in roughly[:_N_LAID])
-    return [*(Other(*compare(fit), fit) for fit in finely), *roughly[_N_LAID:]]
+        proposed += [(shift.share, move_about(best.center, shift) @ turned) for shift in shifts]
+    proposed.sort(key=lambda place: -place[0])
+    starts = (Place(scene, index, matrix) for _, matrix in proposed[: around.n_places])
+    fits = (_fit(start, match, _N_POINTS) for start in starts)
+    roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
+    finely = (_fit(other.place, match, None) for other in roughly[:_N_FITTED])
+    return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[_N_FITTED:]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:
@@ -367,15 +322,11 @@ def log10_gap(best: float, others: Sequence[float]) -> float:
     return n * math.log10(1.0 + gap / (n * max(usual, _LEAST_SPACING)))
 
 
-def _lay(
-    start: FloatArray, scene: Scene, index: ReferenceIndex, match: MatchOptions, n_points: int | None
-) -> FloatArray:
+def _fit(start: Place, match: MatchOptions, n_points: int | None) -> Place:
     """Refine a place; return the start if the refinement diverges."""
-    gsd = sampling(start, scene.size)
-    matched, _ = match_intersections(start, scene, index)
-    refined = refine(start, scene, index, matched, match.refine, n_points, held=True)
-    if refined is None or judge(refined.matrix, scene.size, match.camera) is not None:
+    args = start.matrix, start.scene, start.index, start.matched
+    refined = refine(*args, match.refine, n_points, held=True)
+    if refined is None or judge(refined.matrix, start.scene.size, match.camera) is not None:
         return start
-    if abs(math.log(sampling(refined.matrix, scene.size) / gsd)) > math.log(1.1):
-        return start
-    return refined.matrix
+    fitted = start.at(refined)
+    return start if abs(math.log(fitted.gsd_m / start.gsd_m)) > math.log(1.1) else fitted

@@ -29,6 +29,7 @@ from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, me
 from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
 from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, Trial, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import denormalise
 from roadgeo.matching.scene import AGREE_DEG, MIN_COS, Scene
 from roadgeo.matching.search import ALONE, Ahead
@@ -40,7 +41,6 @@ __all__ = [
     "PERSPECTIVE_SIGMA",
     "RADIUS_M",
     "RING_STEP",
-    "Grown",
     "RoadGrower",
     "RoadRaster",
     "RoadRound",
@@ -306,14 +306,6 @@ PERSPECTIVE_SIGMA = 0.4
 _GO_ON, _SURE = (16, 6, 3), 2
 
 
-@dataclass(frozen=True)
-class Grown:
-    """A grown proposal: query plane to reference plane (3, 3), and how close to roads the road points lie, 0 to 1."""
-
-    matrix: FloatArray
-    closeness: float
-
-
 class RoadGrower:
     """Grows proposals of a scene on a map."""
 
@@ -324,8 +316,10 @@ class RoadGrower:
         thin = max(1, len(scene.dense_points) // _MAX_POINTS)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
 
-    def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Grown]:
+    def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Place]:
         """Grow proposals of query intersection `anchor`; return those that were not given up, in their order.
+
+        They are supported by how close to roads their road points lie, 0 to 1.
 
         `references` (M,) are the map intersections that it is laid on, `affines` (M, 4) how: 2 x 2, row-major.
         """
@@ -346,7 +340,7 @@ class RoadGrower:
         grown = []
         for k in np.flatnonzero(closeness >= 0.0):
             matrix = denormalise(ps[k], at, half_size, origins[k], float(units[k]))
-            grown.append(Grown(matrix / matrix[2, 2], float(closeness[k])))
+            grown.append(Place(self.scene, self.index, matrix / matrix[2, 2], float(closeness[k])))
         return grown
 
 
@@ -421,7 +415,7 @@ class RoadRound(NamedTuple):
     anchor: int
     n_tried: int
     n_proposed: int
-    grown: list[Grown]
+    grown: list[Place]
 
 
 class RoadSearch:
@@ -460,7 +454,7 @@ class RoadSearch:
             self.turnout.n_tried += votes.n_tried
             best = slice(_MAX_GROWN)
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
-            some = sorted(grown, key=lambda place: -place.closeness)
+            some = sorted(grown, key=lambda place: -place.support)
             yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[:_MAX_KEPT])
 
 

@@ -34,8 +34,8 @@ class Estimator(Protocol[Model]):
     def work(self) -> float:
         """The work done until now, in seconds of a usual machine; by counts, not by a clock."""
 
-    def score(self, model: Model) -> float:
-        """Return the log10 odds of a model."""
+    def settle(self, model: Model) -> tuple[Model, float]:
+        """Return a model refined, and its score (log10); -inf for one that is impossible."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SearchOptions:
     accept : float
         A model that reaches it may end the search.
     work_limit_s : float
-        No further round begins, and no further model is scored, after this work: seconds of a usual machine, counted,
+        No further round begins, and no further model is settled, after this work: seconds of a usual machine, counted,
         not measured, so that answers do not depend on the load. The limit holds for a map of 15,000 intersections; on a
         larger map it grows by the root of the ratio.
     time_limit_s : float
@@ -120,9 +120,9 @@ class Search(Generic[Model]):
     def _take(self, models: Iterable[Model], budget: _Budget) -> None:
         """Score the models of a round."""
         for model in models:
-            score = self.estimator.score(model)
+            settled, score = self.estimator.settle(model)
             if self.best is None or score > self.score:
-                self.score, self.best = score, model
+                self.score, self.best = score, settled
             self._charge(budget)
             if budget.spent:
                 break

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
-from roadgeo.geometry.camera import CameraFault, sampling
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.camera import CameraFault
 from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Location
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.events import Events
+from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.place import Place
 
 __all__ = ["TruthStory", "finite_or_none", "tell_truth", "true_place"]
 
@@ -44,7 +44,7 @@ class TruthStory:
     Attributes
     ----------
     lost_at : str or None
-        The stage that lost it: "map", "proposals", "on_roads", "survived", "camera", "verified", "odds" or "margin";
+        The stage that lost it: "map", "proposals", "on_roads", "survived", "camera", "verified", "odds" or "rival";
         None if the mask was located there. `said` is the same in a sentence.
     counts : dict
         The number of times the place was met at "proposals", "on_roads", "survived", "camera" (refused) and "verified".
@@ -73,12 +73,14 @@ def true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
     return None
 
 
-def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, options: LocateOptions) -> TruthStory:
+def tell_truth(
+    lonlat: tuple[float, float], searched: Searched, location: Location, options: LocateOptions
+) -> TruthStory:
     """Describe the stage that lost the true place; `location` is the answer on this reference."""
-    if events.estimator is None:
+    if searched.estimator is None:
         return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_MET, 0), None)
-    there = _TruePlace(events.estimator, lonlat)
-    return there.story(*there.met(events), location, options.min_log10_odds)
+    there = _TruePlace(searched.estimator, lonlat)
+    return there.story(*there.met(searched), location, options.min_log10_odds)
 
 
 class _TruePlace:
@@ -88,32 +90,37 @@ class _TruePlace:
         self.estimator, self.lonlat = estimator, lonlat
         self.xy = np.asarray(from_lonlat(estimator.index.plane, np.array([lonlat]))[0], float)
 
-    def met(self, events: Events) -> tuple[dict[str, int], list[CameraFault], float]:
+    def met(self, searched: Searched) -> tuple[dict[str, int], list[CameraFault], float]:
         """Return the number of times each stage met it, the camera's objections to it, and its best score."""
-        counts, scene, index = dict.fromkeys(_MET, 0), self.estimator.scene, self.estimator.index
+        scene, index, events = self.estimator.scene, self.estimator.index, searched.events
+        counts = dict.fromkeys(_MET, 0)
         for proposals, _, kept in events.of("screened"):
             linear = proposals.affine.reshape(-1, 2, 2)
             middles = index.xy[proposals.reference] + linear @ (scene.center - scene.intersections.xy[proposals.anchor])
             near = self._is_near(middles, np.sqrt(np.abs(np.linalg.det(linear))))
             counts["proposals"] += int(near.sum())
             counts["on_roads"] += int(near[kept].sum())
-        scored = [entry for entry in events.of("scored") if self._is_there(entry.model.matrix)]
-        faults = [fault for fault, matrix in events.of("refused") if self._is_there(matrix / matrix[2, 2])]
-        faults += [entry.fault for entry in scored if entry.fault is not None]
-        survived = sum(self._is_there(matrix) for grown in events.of("grown") for matrix in grown)
-        counts |= {"survived": survived, "camera": len(faults), "verified": len(scored)}
-        return counts, faults, max((entry.log10_odds for entry in scored), default=-math.inf)
+        settled = [place for place in events.of("settled") if self._is_there(place)]
+        faults = [fault for fault, matrix in events.of("refused") if self._lies_there(matrix / matrix[2, 2])]
+        faults += [place.fault for place in settled if place.fault is not None]
+        survived = sum(self._lies_there(matrix) for grown in events.of("grown") for matrix in grown)
+        counts |= {"survived": survived, "camera": len(faults), "verified": len(settled)}
+        listed = (*searched.compared, *searched.places[1:])
+        scores = [place.score for place in listed if self._is_there(place)] or [min(one.score, 0.0) for one in settled]
+        return counts, faults, max(scores, default=-math.inf)
 
     def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:
         """Return which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
         limit = np.maximum(_AT_LEAST_M, _ROUGHLY * scales * self.estimator.scene.half_size)
         return np.asarray(np.hypot(*(xy - self.xy).T) <= limit)
 
-    def _is_there(self, matrix: FloatArray) -> bool:
+    def _lies_there(self, matrix: FloatArray) -> bool:
         """Return whether a homography puts the middle of the frame near the truth."""
-        scene = self.estimator.scene
-        scale = np.array([sampling(matrix, scene.size)])
-        return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
+        return self._is_there(Place(self.estimator.scene, self.estimator.index, matrix))
+
+    def _is_there(self, place: Place) -> bool:
+        """Return whether a place lies near the truth."""
+        return bool(self._is_near(place.center[None], np.array([place.gsd_m]))[0])
 
     def story(
         self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: float
@@ -135,7 +142,7 @@ class _TruePlace:
 
     def _weighed(self, best: float, location: Location, needed: float) -> tuple[str | None, str]:
         """Describe the fate of the truth after it was compared with the map."""
-        score, located = f"reached log10 odds {best:.1f}", False
+        score, located = f"reached a score of {best:.1f}", False
         if location.located and location.center is not None:
             center = np.array([[location.center.lon, location.center.lat]])
             xy = from_lonlat(self.estimator.index.plane, center)
@@ -143,7 +150,7 @@ class _TruePlace:
         if best < needed and not located:
             return "odds", f"{score}, {needed:g} are needed"
         if not located:
-            return "margin", f"{score}, but another place as much, or it was met too late"
+            return "rival", f"{score}, but another place as much, or it was met too late"
         if best < needed:
             return None, f"{score}, but leads any other place where these streets repeat, and was located"
         return None, f"{score} and was located"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -16,17 +16,17 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import find_pose, turned
-from roadgeo.geometry.projection import LocalPlane, from_lonlat, grid_north, metres_apart, to_lonlat
+from roadgeo.geometry.projection import from_lonlat, grid_north, to_lonlat
 from roadgeo.geometry.similarity import find_similarity
 from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import Camera, Evidence, Location, Place, Reason, Seen, Stats
 from roadgeo.matching.estimator import MatchOptions
-from roadgeo.matching.evidence import agreement
-from roadgeo.matching.methods import N_PLACES, Fit, Found
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.methods import N_PLACES, Searched
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.parts import same_within_m
+from roadgeo.matching.place import Place as Hyp
 from roadgeo.matching.refinement import corner_sigmas
-from roadgeo.matching.scene import Query, Scene
+from roadgeo.matching.scene import Query
 
 __all__ = ["center_of", "decide", "place_frame"]
 
@@ -45,20 +45,7 @@ _MOST_UNSURE = 0.03
 _LEAST_LOST = 0.02
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    """A place, its reference, and its lead over all places that were tried on any reference."""
-
-    found: Found
-    fit: Fit
-    center: Place
-
-    @property
-    def score(self) -> float:
-        return self.fit.log10_odds
-
-
-def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+def decide(query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
     """Judge the places found on one or more references, and describe the answer."""
     started = perf_counter()
     location = _judge(query, found, options)
@@ -66,15 +53,15 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     return replace(location, seconds=replace(seconds, match=seconds.match + perf_counter() - started))
 
 
-def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+def _judge(query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
     """Compare the places with each other and with the thresholds; describe the best, or the reason for a refusal."""
     location = _describe_work(query, found)
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
     # The best place of all references, and the others.
-    candidates = _pool(query, found)
+    candidates = _pool(found)
     best, rivals = (candidates[0] if candidates else None), candidates[1:]
-    listed = _listed(query, found, candidates)
+    listed = _listed(found, candidates)
     places = tuple(_describe(location, query, listed, number, options) for number in range(1, 1 + len(listed)))
     if best is not None:
         runner_up = places[1] if rivals else None
@@ -84,7 +71,7 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     if best is None or (best.score < needed and rival is None):
         return _refuse(replace(location, alternatives=places), query, found, listed, options)
     best = _against(best, rivals)
-    placed = place_frame(_on(location, best.found), query, best.fit, options.match)
+    placed = place_frame(_on(location, best.index), query, best, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
     if rival is not None:
         runner_up = _seen_from(best, rival)
@@ -95,13 +82,13 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     if half:
         return replace(placed, status="ambiguous", reason=half + cut, reason_code=Reason.HALF_A_PLACE)
     reason = (
-        f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
-        f"; score {best.score:.1f}{cut}"
+        f"{placed.n_matched} of {placed.n_intersections} intersections and {best.agreement.forward:.0%} of the roads "
+        f"agree; score {best.score:.1f}{cut}"
     )
     return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
 
 
-def _describe_work(query: Query, found: Sequence[Found]) -> Location:
+def _describe_work(query: Query, found: Sequence[Searched]) -> Location:
     """Return the fields that do not depend on the answer."""
     stats = [one.stats for one in found]
     work = Stats(
@@ -126,84 +113,70 @@ def _describe_work(query: Query, found: Sequence[Found]) -> Location:
     )
 
 
-def _ended_by(found: Sequence[Found]) -> str:
+def _ended_by(found: Sequence[Searched]) -> str:
     """Return why a search of one or more parts ended: an answer, a limit, or nothing left to try."""
     ends = {one.stopped for one in found}
     return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
 
-def _on(location: Location, found: Found) -> Location:
+def _on(location: Location, index: ReferenceIndex) -> Location:
     """Name the reference of an answer."""
-    return replace(location, reference=found.index.name, attribution=str(found.index.meta.get("attribution") or ""))
+    return replace(location, reference=index.name, attribution=str(index.meta.get("attribution") or ""))
 
 
-def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
+def _pool(found: Sequence[Searched]) -> list[Hyp]:
     """Return the places of all references, the best first; a place on overlapping parts occurs once.
 
     Places on different references are ranked by likelihood.
     """
-    return _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.fits])
+    return _distinct([place for one in found for place in one.compared])
 
 
-def _candidate(query: Query, found: Found, fit: Fit) -> _Candidate:
-    return _Candidate(found, fit, center_of(fit.matrix, query.scene, fit.index.plane, fit.log10_odds))
-
-
-def _distinct(query: Query, pool: Sequence[_Candidate], known: Sequence[_Candidate] = ()) -> list[_Candidate]:
-    """Return the places that are not known, the best first, each once."""
+def _distinct(pool: Sequence[Hyp], known: Sequence[Hyp] = ()) -> list[Hyp]:
+    """Return the places that are not known, the best first, each once; places of one search are different."""
     distinct = list(known)
-    for candidate in sorted(pool, key=lambda one: (-one.fit.explained, -one.score)):
-        if all(_differ(query, one, candidate) for one in distinct):
-            distinct.append(candidate)
+    for place in sorted(pool, key=lambda one: (-one.explained, -one.score)):
+        if not any(place.index is not other.index and place.same(other) for other in distinct):
+            distinct.append(place)
     return distinct[len(known) :]
 
 
-def _listed(query: Query, found: Sequence[Found], candidates: Sequence[_Candidate]) -> list[_Candidate]:
+def _listed(found: Sequence[Searched], candidates: Sequence[Hyp]) -> list[Hyp]:
     """Return the places that an answer lists: the candidates, then others that were verified."""
     if not candidates:
         return []
-    further = _distinct(query, [_candidate(query, one, fit) for one in found for fit in one.further], candidates)
+    further = _distinct([place for one in found for place in one.places[1:]], candidates)
     return [*candidates, *further][:N_PLACES]
 
 
-def _describe(
-    location: Location, query: Query, listed: Sequence[_Candidate], number: int, options: LocateOptions
-) -> Place:
+def _describe(location: Location, query: Query, listed: Sequence[Hyp], number: int, options: LocateOptions) -> Place:
     """Describe the listed place of this number, from 1, with its footprint; whole, if it may be taken."""
     one = listed[number - 1]
-    corners = Homography(one.fit.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
-    plane, frame = one.fit.index.plane, None
+    corners = Homography(one.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
+    plane, frame = one.index.plane, None
     ring = tuple((lon, lat) for lon, lat in to_lonlat(plane.crs, plane.to_crs(corners)).tolist())
     if options.take is not None and number <= options.take:
-        frame = place_frame(_on(location, one.found), query, one.fit, options.match)
+        frame = place_frame(_on(location, one.index), query, one, options.match)
     return replace(_seen_from(listed[0], one), footprint_lonlat=ring, frame=frame)
 
 
-def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
-    """Return whether two candidates are different places: on the same part always, else if they are too far apart."""
-    if a.found is b.found:
-        return True
-    places = [np.array([one.center.lon, one.center.lat]) for one in (a, b)]
-    return metres_apart(*places) > same_within_m(a.found.index, b.found.index, b.fit.matrix, query.scene.size)
-
-
-def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
+def _seen_from(best: Hyp, rival: Hyp) -> Place:
     """Return the middle of a rival in the CRS of the best place."""
-    if best.found is rival.found:
-        return rival.center
-    plane = best.fit.index.plane
-    x, y = plane.to_crs(from_lonlat(plane, np.array([[rival.center.lon, rival.center.lat]])))[0]
-    return replace(rival.center, x=float(x), y=float(y))
+    center = center_of(rival)
+    if best.index.is_of_map(rival.index):
+        return center
+    plane = best.index.plane
+    x, y = plane.to_crs(from_lonlat(plane, rival.lonlat[None]))[0]
+    return replace(center, x=float(x), y=float(y))
 
 
-def _against(best: _Candidate, rivals: Sequence[_Candidate]) -> _Candidate:
+def _against(best: Hyp, rivals: Sequence[Hyp]) -> Hyp:
     """Return a place with its lead over the places on all references."""
-    leads = [best.fit.explained - one.fit.explained for one in rivals if one.found is not best.found]
-    odds = min([best.score, *(lead / best.fit.statement_px for lead in leads)])
-    return replace(best, fit=replace(best.fit, log10_odds=odds), center=replace(best.center, log10_odds=odds))
+    leads = [best.explained - one.explained for one in rivals if one.index is not best.index]
+    return best.but(score=min([best.score, *(lead / best.statement_px for lead in leads)]))
 
 
-def _equal(best: _Candidate, rivals: Sequence[_Candidate], needed: float) -> _Candidate | None:
+def _equal(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp | None:
     """Return a rival that makes the best place ambiguous, or None.
 
     If no place would be reported, that is a rival that agrees as well as the best place where streets repeat. Otherwise
@@ -214,9 +187,9 @@ def _equal(best: _Candidate, rivals: Sequence[_Candidate], needed: float) -> _Ca
     return next((one for one in rivals if _against(best, [one]).score < needed), None)
 
 
-def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
+def _are_alike(best: Hyp, rival: Hyp) -> bool:
     """Return whether both places agree so well that only repeating streets explain it, whatever their scores."""
-    return min(best.fit.agreement, rival.fit.agreement) >= _LIKE_THE_TRUTH
+    return min(best.agreeing, rival.agreeing) >= _LIKE_THE_TRUTH
 
 
 def _only_half(placed: Location) -> str:
@@ -234,22 +207,22 @@ def _only_half(placed: Location) -> str:
     )
 
 
-def _two_places(best: _Candidate, rival: _Candidate) -> str:
+def _two_places(best: Hyp, rival: Hyp) -> str:
     on = ("", "")
-    if best.found.index.name != rival.found.index.name:
-        on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
+    if best.index.name != rival.index.name:
+        on = (f" on {best.index.name}", f" on {rival.index.name}")
     return (
-        f"two places fit almost equally, for streets repeat there: {best.fit.agreement:.0%} agrees at one{on[0]}, "
-        f"{rival.fit.agreement:.0%} at another{on[1]}"
+        f"two places fit almost equally, for streets repeat there: {best.agreeing:.0%} agrees at one{on[0]}, "
+        f"{rival.agreeing:.0%} at another{on[1]}"
     )
 
 
-def _decide_pairs(location: Location, query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+def _decide_pairs(location: Location, query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
     """Report the place that the paper's method found; the method has no scores."""
-    best = next((one for one in found if one.fits), None)
+    best = next((one for one in found if one.places), None)
     if best is None:
         return _refuse(location, query, found, [], options)
-    placed = place_frame(_on(location, best), query, best.fits[0], options.match)
+    placed = place_frame(_on(location, best.index), query, best.places[0], options.match)
     return replace(placed, status="located", reason=best.said, reason_code=Reason.LOCATED)
 
 
@@ -257,17 +230,18 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
 
 
 def _refuse(
-    location: Location, query: Query, found: Sequence[Found], listed: Sequence[_Candidate], options: LocateOptions
+    location: Location, query: Query, found: Sequence[Searched], listed: Sequence[Hyp], options: LocateOptions
 ) -> Location:
     """Describe why nothing is reported, for the reference that came nearest."""
-    nearest = listed[0].found if listed else max(found, key=lambda one: one.n_tried)
+    nearest = next((one for one in found if listed and listed[0].index.is_of_map(one.index)), None)
+    nearest = nearest or max(found, key=lambda one: one.n_tried)
     code, reason = _why_nothing(query, nearest, listed, options)
     location = replace(location, reason_code=code)
     distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
     if len(distinct) == 1:
-        return replace(_on(location, nearest), reason=reason)
+        return replace(_on(location, nearest.index), reason=reason)
     names = ", ".join(distinct)
-    owed = dict.fromkeys(_on(location, one).attribution for one in found)
+    owed = dict.fromkeys(_on(location, one.index).attribution for one in found)
     return replace(
         location,
         reference=names,
@@ -276,9 +250,7 @@ def _refuse(
     )
 
 
-def _why_nothing(
-    query: Query, found: Found, listed: Sequence[_Candidate], options: LocateOptions
-) -> tuple[Reason, str]:
+def _why_nothing(query: Query, found: Searched, listed: Sequence[Hyp], options: LocateOptions) -> tuple[Reason, str]:
     """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
         return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
@@ -305,14 +277,13 @@ def _why_nothing(
     )
 
 
-def _what_may_help(query: Query, listed: Sequence[_Candidate], options: LocateOptions) -> str:
+def _what_may_help(query: Query, listed: Sequence[Hyp], options: LocateOptions) -> str:
     """List what may decide: more to see, and the missing hints, with the number of listed places that each leaves."""
     camera, usual = options.match.camera, CameraOptions()
-    views = [pose(one.fit.matrix, query.scene.size) for one in listed]
-    spots = [np.array([one.center.lon, one.center.lat]) for one in listed]
+    views = [pose(one.matrix, query.scene.size) for one in listed]
     turned = [abs((view.rotation_deg - views[0].rotation_deg + 180.0) % 360.0 - 180.0) for view in views]
     scaled = [abs(math.log(view.gsd_m / views[0].gsd_m)) for view in views]
-    away = [metres_apart(spots[0], spot) for spot in spots]
+    away = [listed[0].apart_m(one) for one in listed]
     place_lacks = options.near is None and options.match.within is None
     hints = (
         (camera.gsd_m == usual.gsd_m, "the size of a pixel", "5 %", "(--gsd)", scaled, math.log(1.05)),
@@ -335,7 +306,7 @@ def _lead(score: float, needed: float) -> str:
     return f"the best has a score of {math.floor(10.0 * score) / 10.0:g}, {needed:g} is asked for"
 
 
-def _how_far(query: Query, found: Found, options: LocateOptions) -> str:
+def _how_far(query: Query, found: Searched, options: LocateOptions) -> str:
     """Describe the progress of a search that was cut short, and hints that would shorten it."""
     far = f"{found.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
     (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
@@ -375,7 +346,7 @@ def searched_within(options: LocateOptions) -> str:
 # --- where the frame lies on Earth, and how it was seen ---------------------------------------------------------------
 
 
-def place_frame(location: Location, query: Query, fit: Fit, options: MatchOptions) -> Location:
+def place_frame(location: Location, query: Query, fit: Hyp, options: MatchOptions) -> Location:
     """Fill in everything that follows from a fit's homography and its matches."""
     # The corners and the middle in the map's CRS.
     plane, scene = fit.index.plane, query.scene
@@ -392,7 +363,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
     reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
     # The camera's covariance comes from all eight parameters: the pose of a camera that looks straight down has six.
     seat = _find_camera(fit, level.matrix, scene.size, focal_px, north)
-    odds = 0.0 if math.isnan(fit.log10_odds) else fit.log10_odds
+    odds = 0.0 if math.isnan(fit.score) else fit.score
     return replace(
         location,
         crs=plane.crs,
@@ -402,8 +373,8 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
         center=_place(ground[4], lonlat[4], odds),
         fitted="homography" if level is fit else "similarity",
         lens_k1=fit.lens_k1,
-        corner_sigma_m=level.corner_sigma_m,
-        corner_covariance_m2=level.corner_covariance_m2,
+        corner_sigma_m=None if level.covariance is None else corner_sigmas(level.covariance),
+        corner_covariance_m2=level.covariance,
         lonlat_accuracy_m=exactness(plane.crs, LONLAT, lonlat[4].tolist()).sigma_m,
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
@@ -411,38 +382,38 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
         tilt_source=camera.source if seat is None else seat.source,
         n_matched=int(chosen.sum()),
         inlier_ratio=float(chosen.mean()),
-        log10_odds=None if math.isnan(fit.log10_odds) else fit.log10_odds,
+        log10_odds=None if math.isnan(fit.score) else fit.score,
         camera=seat,
-        evidence=Evidence(query.graph, scene.intersections.xy[chosen], reference_xy, fit.distance[chosen]),
+        evidence=Evidence(query.graph, scene.intersections.xy[chosen], reference_xy, fit.matches[1][chosen]),
     )
 
 
-def _level(fit: Fit, query: Query) -> Fit:
+def _level(fit: Hyp, query: Query) -> Hyp:
     """Return a fit restricted to a camera that looks straight down, unless the roads are inconsistent with it."""
-    if fit.corner_covariance_m2 is None or fit.lens_k1:
+    if fit.refined is None or fit.lens_k1:
         return fit
     scene = query.scene
-    found = find_similarity(fit.matrix, scene.corners, fit.corner_covariance_m2)
+    found = find_similarity(fit.matrix, scene.corners, fit.refined.corner_covariance_m2)
     if found is None:
         return fit
     matrix, covariance = found.matrix, found.corner_covariance + found.doubt
     # The covariance may be too large. Roads that agreed must still agree.
-    agreeing, _, _ = agreement(matrix, scene, fit.index)
-    if not agreeing.forward >= fit.agreeing - _LEAST_LOST:
-        return fit
-    return replace(fit, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=corner_sigmas(covariance))
+    sigmas = corner_sigmas(covariance)
+    refined = replace(fit.refined, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=sigmas)
+    level = replace(fit, matrix=matrix, refined=refined)
+    return level if level.agreement.forward >= fit.agreement.forward - _LEAST_LOST else fit
 
 
 def _find_camera(
-    fit: Fit, matrix: FloatArray, size: tuple[int, int], focal_px: float | None, north: float
+    fit: Hyp, matrix: FloatArray, size: tuple[int, int], focal_px: float | None, north: float
 ) -> Camera | None:
     """Return the camera of a fit's `matrix`, levelled or not.
 
     `north` is the direction of the plane's y axis from true north.
     """
-    if fit.corner_covariance_m2 is None:
+    if fit.covariance is None:
         return None
-    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, focal_px)
+    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.covariance, focal_px)
     if found is None:
         return None
     plane, rotation = fit.index.plane, turned(found.rotation, -north)
@@ -454,11 +425,9 @@ def _find_camera(
     return Camera(x, y, lon, lat, height, heading, pitch, roll, *lens, found.covariance, rotation)
 
 
-def center_of(matrix: FloatArray, scene: Scene, plane: LocalPlane, log10_odds: float) -> Place:
+def center_of(place: Hyp) -> Place:
     """Return the middle of the frame as a place."""
-    ground = plane.to_crs(Homography(matrix).everywhere(scene.center)[None])
-    lonlat = to_lonlat(plane.crs, ground)
-    return _place(ground[0], lonlat[0], log10_odds)
+    return _place(place.index.plane.to_crs(place.center), place.lonlat, place.score)
 
 
 def _place(xy: FloatArray, lonlat: FloatArray, log10_odds: float) -> Place:

@@ -16,8 +16,9 @@ from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
-from roadgeo.matching.explanation import Explanation, RejectedPlace, Story
+from roadgeo.matching.explanation import Explanation, Story, Told
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Scene
 from roadgeo.outputs.drawing.layers import Color, Dots, Layer, Lines, Ring, rgb
 from roadgeo.outputs.drawing.raster import (
@@ -138,51 +139,51 @@ def _draw_funnel(story: Story) -> list[AnyArray]:
 # --- the places -------------------------------------------------------------------------------------------------------
 
 
-def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: ReferenceIndex) -> list[AnyArray]:
+def _draw_places(places: Sequence[Told], scene: Scene, index: ReferenceIndex) -> list[AnyArray]:
     """Draw the best places, two or three in a row."""
     if not places:
         return [line("No place got as far as being compared with the map.", 22, FAINT)]
     columns = min(max(len(places), 2), 3)
     side = (_PLACES - (columns - 1) * _MARGIN) // columns
     drawn = [
-        below(_draw_place(place, scene, index, side), *_caption(number, place, side), width=side)
-        for number, place in enumerate(places, 1)
+        below(_draw_place(told.place, scene, index, side), *_caption(number, told, side), width=side)
+        for number, told in enumerate(places, 1)
     ]
     rows = [beside(*drawn[k : k + columns], gap=_MARGIN) for k in range(0, len(drawn), columns)]
     return [below(*rows, blank(0, 0), gap=20)]
 
 
-def _draw_place(place: RejectedPlace, scene: Scene, index: ReferenceIndex, side: int) -> AnyArray:
+def _draw_place(place: Place, scene: Scene, index: ReferenceIndex, side: int) -> AnyArray:
     """Draw the map around a place, and on it the mask's roads: (side, side, 3)."""
-    middle = place.footprint.min(axis=0) / 2 + place.footprint.max(axis=0) / 2
-    reach = 0.57 * float(np.ptp(place.footprint, axis=0).max())
+    middle = place.corners.min(axis=0) / 2 + place.corners.max(axis=0) / 2
+    reach = 0.57 * float(np.ptp(place.corners, axis=0).max())
     # Its window in the map's CRS, as the layers have it, which is the plane shifted.
     west, south = index.plane.to_crs(middle - reach).tolist()
     window = Window(west, south + 2 * reach, 2 * reach, 2 * reach)
-    corners = window.place(index.plane.to_crs(place.footprint))
+    corners = window.place(index.plane.to_crs(place.corners))
     canvas = Canvas.of(window.box, side, side)
     canvas.draw([Layer("ground", "", [Ring(corners)]), map_layer(index, window, window, _PLACE_VERTICES)])
     for name, agrees in (("query-roads", False), ("agreeing-roads", True)):
-        strokes = window.place(index.plane.to_crs(_strokes(scene, place, place.agrees == agrees)))
+        strokes = window.place(index.plane.to_crs(_strokes(scene, place, place.on_roads == agrees)))
         canvas.draw([Layer(name, "", [Lines(list(strokes))])])
     canvas.draw([Layer("footprint", "", [Ring(corners, up=True)])])
     return canvas.image[:side, :side]
 
 
-def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray:
+def _strokes(scene: Scene, place: Place, chosen: AnyArray) -> FloatArray:
     """Map (C, 2, 2) short strokes along the mask's roads around the chosen road points to the plane."""
     half = 0.5 * scene.road_length_px / max(len(scene.points), 1) * scene.directions[chosen]
     ends = np.stack([scene.points[chosen] - half, scene.points[chosen] + half], axis=1)
-    strokes = Homography(place.scored.model.matrix)(ends)
+    strokes = Homography(place.matrix)(ends)
     return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
-def _caption(number: int, place: RejectedPlace, side: int) -> list[AnyArray]:
-    log10_odds = place.scored.log10_odds
-    odds = f"score {round(log10_odds, 1) + 0.0:.1f}" if math.isfinite(log10_odds) else "no fit"
-    where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.camera.gsd_m:.2f} m/px"
-    why = [line(text, 15) for text in textwrap.wrap(place.why, side // 8)[:3]]
-    return [line(f"{number}   {odds}", 19, bold=True), line(where, 15, FAINT), *why]
+def _caption(number: int, told: Told, side: int) -> list[AnyArray]:
+    place, (lon, lat) = told.place, told.place.lonlat.tolist()
+    score = f"score {round(place.score, 1) + 0.0:.1f}" if math.isfinite(place.score) else "no fit"
+    where = f"{format_lonlat(lon, lat)}   ·   {place.gsd_m:.2f} m/px"
+    why = [line(text, 15) for text in textwrap.wrap(told.why, side // 8)[:3]]
+    return [line(f"{number}   {score}", 19, bold=True), line(where, 15, FAINT), *why]
 
 
 # --- notes ------------------------------------------------------------------------------------------------------------

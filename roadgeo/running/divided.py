@@ -195,8 +195,8 @@ class _Searcher:
         found = [result.less_likely(against) for result in found]
         least = options.min_log10_odds - options.min_margin
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
-        fits = [fit for result in found for fit in result.fits if fit.log10_odds >= least]
-        places = [(fit.log10_odds, by_path[_path(fit.index)]) for fit in fits]
+        strong = [place for result in found for place in result.compared if place.score >= least]
+        places = [(place.score, by_path[_path(place.index)]) for place in strong]
         return _Answer(decide(query, found, options), places, names)
 
 

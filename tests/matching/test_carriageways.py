@@ -12,10 +12,9 @@ from worlds.scenes import camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraFault
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.evidence import agreement
 from roadgeo.matching.finishing import measure_corners
-from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import build_index
+from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import RefineOptions, between_carriageways, nearest_of, refine, refine_between
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
@@ -128,11 +127,11 @@ def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, 
     monkeypatch.setattr(estimator, "judge", lambda matrix, rough=False: fault)
     given = fit(truth, scene, town[1])
     nothing = np.full(len(scene.intersections), -1)
-    found, _, _ = agreement(given.matrix, scene, town[1])
-    best = Hypothesis(given.matrix, 1.0, nothing, refined=given, found=found)
-    measure_corners(estimator, best, 10.0)
+    weight = Weight(20.0, 480.0)
+    compared = Place(scene, town[1], given.matrix, grown=nothing, refined=given, score=10.0, by=weight)
+    best = measure_corners(estimator, compared)
     error, before = (error_of(matrix, truth, scene) for matrix in (best.refined.matrix, given.matrix))
-    assert best.found is found  # the odds rest on it
+    assert (best.score, best.by) == (10.0, weight)  # the answer rests on it
     assert np.array_equal(best.matrix, best.refined.matrix)
     assert error == before if fault else error < 0.4 * before
 

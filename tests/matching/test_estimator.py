@@ -45,7 +45,7 @@ def test_finds_where_a_camera_looked(town, tilt, sight):
         assert result.score >= ACCEPT
         assert result.stopped == "accepted"
         assert gap(result, truth, scene) < 6
-        assert np.hypot(*(estimator.center(result.best) - mapped(truth, scene.center[None])[0])) < 2
+        assert np.hypot(*(result.best.center - mapped(truth, scene.center[None])[0])) < 2
         assert estimator.n_tuples >= estimator.n_verified > 0
 
 

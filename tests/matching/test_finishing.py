@@ -10,7 +10,7 @@ from worlds.scenes import Sight, mapped, sight_of
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.finishing import measure_corners, refine_beside, with_honest_corners
-from roadgeo.matching.growing import Hypothesis
+from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 
 
@@ -22,12 +22,13 @@ from roadgeo.matching.refinement import Refined, RefineOptions, refine
 def test_only_places_that_may_be_reported_are_fitted_to_the_whole_frame(town, score, agreeing, within, mended):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     matrix, nothing = np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]]) @ truth, np.full(len(scene.intersections), -1)
-    rough, found = Refined(matrix, np.ones(4), 1.0, np.eye(8)), Agreement(0, 10, agreeing, 0.8)
-    best = Hypothesis(matrix, 1.0, nothing, refined=rough, found=found)
-    measure_corners(TripleEstimator(scene, town[1], MatchOptions(within=within)), best, score)
+    rough, weight = Refined(matrix, np.ones(4), 1.0, np.eye(8)), Weight(20.0, 480.0)
+    compared = Place(scene, town[1], matrix, grown=nothing, refined=rough, score=score, by=weight)
+    vars(compared)["agreement"] = Agreement(agreeing, 0.8)
+    best = measure_corners(TripleEstimator(scene, town[1], MatchOptions(within=within)), compared)
     gaps = np.hypot(*(mapped(best.refined.matrix, scene.corners) - mapped(truth, scene.corners)).T)
     assert (gaps.max() < 1.5) == mended
-    assert best.found is found  # the odds rest on it
+    assert (best.score, best.by) == (score, weight)  # the answer rests on it
 
 
 def moved(truth, scene, corner, step):
@@ -46,8 +47,8 @@ def gaps(matrix, truth, scene):
 @pytest.mark.parametrize("corner", range(4))
 def test_a_corner_beside_where_it_belongs_comes_back(town, corner):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
-    beside = Refined(moved(truth, scene, corner, (14.0, -9.0)), np.ones(4), 1.0, np.eye(8))
-    found = refine_beside(beside, scene, town[1], RefineOptions())
+    beside = Place(scene, town[1], moved(truth, scene, corner, (14.0, -9.0)))
+    found = refine_beside(beside, scene, RefineOptions())
     assert gaps(beside.matrix, truth, scene).max() > 15.0
     assert gaps(found.matrix, truth, scene).max() < 1.5
 
@@ -58,21 +59,21 @@ def test_the_far_corner_of_a_steep_view_comes_back_from_far_away(town, seed, mis
     truth, scene = sight_of(town[0], seed, tilt=45, sight=Sight(1.0, missing, 0.5))
     way = mapped(truth, scene.corners) - mapped(truth, scene.corners).mean(axis=0)
     far = int(np.hypot(*way.T).argmax())
-    beside = Refined(moved(truth, scene, far, share * way[far]), np.ones(4), 1.0, np.eye(8))
-    found = refine_beside(beside, scene, town[1], RefineOptions())
+    beside = Place(scene, town[1], moved(truth, scene, far, share * way[far]))
+    found = refine_beside(beside, scene, RefineOptions())
     assert gaps(beside.matrix, truth, scene).max() > 400.0
     assert gaps(found.matrix, truth, scene).max() < 2.0
 
 
 def test_where_all_belongs_nothing_better_is_found(town):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
-    assert refine_beside(Refined(truth, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
+    assert refine_beside(Place(scene, town[1], truth), scene, RefineOptions()) is None
 
 
 def test_far_from_all_roads_nothing_is_found(town):
     truth, scene = sight_of(town[0], 5)
     nowhere = truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]])
-    assert refine_beside(Refined(nowhere, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
+    assert refine_beside(Place(scene, town[1], nowhere), scene, RefineOptions()) is None
 
 
 def test_corners_that_depend_on_one_road_are_as_unsure_as_that_road(town):

@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import map_coordinates, uniform_filter
 from worlds.scenes import Sight, camera, look, scene_of, soft
 
+from roadgeo.geometry.camera import pose
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import picture as pictures
 from roadgeo.matching.picture import Picture
@@ -116,13 +117,14 @@ def test_correlation_finds_the_place_among_all_shifts_and_turns(town, scene):
     middle = Homography(TRUTH).everywhere(scene.center)
     start = move_about(middle, Shift(0.0, 0.0, 90.0, 1.0, 0.0)) @ shifted(TRUTH, 250.0, -120.0)
     peaks = picture.correlate(start, 600.0, (0.0, 90.0, 180.0, 270.0), 5, 30.0)
-    assert [peak.worth for peak in peaks] == sorted((peak.worth for peak in peaks), reverse=True)
+    assert [peak.log10_likelihood for peak in peaks] == sorted((peak.log10_likelihood for peak in peaks), reverse=True)
     best = picture.settle(peaks[0])
-    assert peaks[0].turn_deg == 270.0
+    turned = pose(peaks[0].matrix, SIZE).rotation_deg - pose(start, SIZE).rotation_deg
+    assert turned % 360.0 == pytest.approx(270.0)
     assert np.hypot(*(Homography(best.matrix).everywhere(scene.center) - middle)) < 6.0
-    assert best.worth == pytest.approx(picture.weigh(best.matrix), rel=0.01)
-    assert best.worth > 2.0 * picture.settle(peaks[1]).worth
-    assert best.worth >= picture.weigh(peaks[0].matrix)
+    assert best.log10_likelihood == pytest.approx(picture.weigh(best.matrix), rel=0.01)
+    assert best.log10_likelihood > 2.0 * picture.settle(peaks[1]).log10_likelihood
+    assert best.log10_likelihood >= picture.weigh(peaks[0].matrix)
 
 
 def test_a_frame_too_large_for_the_ground_weighs_nothing(town, scene):

@@ -5,15 +5,15 @@ import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
 
 from roadgeo.matching import refinement
-from roadgeo.matching.evidence import match_intersections
 from roadgeo.matching.index import IndexOptions, build_index
+from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import refine
 
 
 def refined(start, scene, index, gsd=1.0, rounds=3):
     matrix, result = start, None
     for _ in range(rounds):
-        matched, _ = match_intersections(matrix, scene, index)
+        matched = Place(scene, index, matrix).matched
         result = refine(matrix, scene, index, matched)
         assert result is not None
         matrix = result.matrix
@@ -74,7 +74,7 @@ def test_claimed_accuracy_is_honest(town, view):
 def test_wrong_matches_do_no_harm(town):
     truth, scene = sight_of(town[0], 5, 20.0, Sight(0.5))
     index = town[1]
-    matched, _ = match_intersections(truth, scene, index)
+    matched = Place(scene, index, truth).matched
     swapped = matched.copy()
     few = np.flatnonzero(matched >= 0)[::6]
     swapped[few] = index.neighbours[matched[few], 0]
@@ -84,14 +84,14 @@ def test_wrong_matches_do_no_harm(town):
 
 def test_fewer_points_do_nearly_as_well(town):
     truth, scene = sight_of(town[0], 6, 20.0, Sight(0.5))
-    matched, _ = match_intersections(truth, scene, town[1])
+    matched = Place(scene, town[1], truth).matched
     result = refine(truth, scene, town[1], matched, n_points=150)
     assert np.abs(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).max() < 2
 
 
 def test_a_floor_under_every_claim(town, monkeypatch):
     truth, scene = sight_of(town[0], 7)
-    matched, _ = match_intersections(truth, scene, town[1])
+    matched = Place(scene, town[1], truth).matched
     monkeypatch.setattr(refinement, "_SIGMA_FLOOR", (3.0, 0.15))
     assert (refine(truth, scene, town[1], matched).corner_sigma_m >= 3.0).all()
 
@@ -106,7 +106,7 @@ def test_nothing_to_stand_on_is_no_refinement(town):
 def test_few_true_matches_are_enough_where_roads_agree(town, n_matches):
     """Of a few lone matches the filter leaves none: the fit used to forget where it began, and failed."""
     truth, scene = sight_of(town[0], 8, 15.0, Sight(0.8))
-    matched, _ = match_intersections(truth, scene, town[1])
+    matched = Place(scene, town[1], truth).matched
     few = np.full(len(matched), -1)
     chosen = np.flatnonzero(matched >= 0)[:: max(1, int((matched >= 0).sum()) // max(n_matches, 1))][:n_matches]
     few[chosen] = matched[chosen]

@@ -13,9 +13,9 @@ from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.rivals import Rivals, Standing, log10_gap, similar_places
+from roadgeo.matching.place import Place
+from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.matching.triples import larger
@@ -40,14 +40,14 @@ def search_of(world, *matrices, near=None, match=None):
     _, index, evidence = world
     estimator = TripleEstimator(evidence.scene, index, match, near)
     for matrix in matrices:
-        estimator.score(Hypothesis.at(matrix, evidence.scene, index))
+        estimator.settle(Place(evidence.scene, index, matrix))
     return Search(estimator), estimator
 
 
 def stand(world, *matrices, n_reference=866, **options):
     """Compare the likeliest of some places with the best other one."""
     item, estimator = search_of(world, *matrices, **options)
-    return Rivals({item: estimator}, Ledger(n_reference=n_reference), NEEDED).standing(item)
+    return Rivals({item: estimator}, Ledger(n_reference=n_reference), NEEDED).compare(item)
 
 
 def test_a_place_that_explains_too_little_to_be_laid_has_places_nearby_too(even):
@@ -70,28 +70,29 @@ def apart(world, matrix, other=None):
 
 @pytest.mark.slow
 def test_the_place_leads_all_others_by_the_streets_that_are_missing_there(broken):
-    standing = stand(broken, broken[0])
-    assert apart(broken, standing.model.matrix) < 2.0
-    assert apart(broken, standing.rival) > 50.0
-    assert standing.log10_lead > NEEDED
+    item, estimator = search_of(broken, broken[0])
+    place = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED).compare(item)
+    assert apart(broken, place.matrix) < 2.0
+    assert apart(broken, place.rival.matrix) > 50.0
+    assert place.score > NEEDED
     # The best other place lies further away than those nearby, by which the search judged.
-    assert standing.log10_lead < standing.model.log10_odds
+    assert place.score < max(met.score for met in estimator.verified)
 
 
 @pytest.mark.slow
 def test_a_rival_that_explains_more_takes_over(broken):
     """The search met a block beside only: that leads nothing, and what leads it is the place."""
     truth, _, evidence = broken
-    standing, direct = stand(broken, beside(truth, evidence)), stand(broken, truth)
-    assert apart(broken, standing.model.matrix) < 2.0
-    assert standing.model.refined is not None  # and it can be told like any that the search met
-    assert standing.log10_lead == pytest.approx(direct.log10_lead, abs=0.5)
+    place, direct = stand(broken, beside(truth, evidence)), stand(broken, truth)
+    assert apart(broken, place.matrix) < 2.0
+    assert place.refined is not None  # and it can be told like any that the search met
+    assert place.score == pytest.approx(direct.score, abs=0.5)
 
 
 @pytest.mark.slow
 def test_where_all_blocks_are_equal_nothing_leads(even):
-    assert stand(even, even[0]).log10_lead < 0.5
-    assert stand(even, even[0], beside(even[0], even[2])).log10_lead < 0.5
+    assert stand(even, even[0]).score < 0.5
+    assert stand(even, even[0], beside(even[0], even[2])).score < 0.5
 
 
 @pytest.mark.slow
@@ -102,19 +103,19 @@ def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeyp
     far = move_about(Homography(truth)(evidence.scene.center), Shift(-550.0, 450.0, 0.0, 1.0, 0.0)) @ truth
     item, estimator = search_of(broken, truth)
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
-    alone = asked.standing(item)
-    estimator.score(Hypothesis.at(far, evidence.scene, broken[1]))
-    both = asked.standing(item)  # it was met after the place was compared
+    alone = asked.compare(item)
+    estimator.settle(Place(evidence.scene, broken[1], far))
+    both = asked.compare(item)  # it was met after the place was compared
     assert alone.rival is None
-    assert apart(broken, both.rival, far) < 5.0
-    assert both.log10_lead <= alone.log10_lead
+    assert apart(broken, both.rival.matrix, far) < 5.0
+    assert both.score <= alone.score
 
 
 @pytest.mark.slow
 def test_on_a_large_map_a_lead_is_worth_less(broken):
     n = 15_000 * 10**4
     small, large = (stand(broken, broken[0], n_reference=count) for count in (866, n))
-    assert small.log10_lead - large.log10_lead > np.log10(larger(n))  # by roads or by the picture, whichever leads more
+    assert small.score - large.score > np.log10(larger(n))  # by roads or by the picture, whichever leads more
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_only_what_the_user_allows_is_a_rival(broken):
     middle = Homography(truth)(evidence.scene.center)
     anywhere, here = stand(broken, truth), stand(broken, truth, near=(*middle, 30.0))
     assert here.rival is None
-    assert here.log10_lead >= anywhere.log10_lead
+    assert here.score >= anywhere.score
     upright = camera(tuple(middle.tolist()), evidence.scene.size, 1.0)
     north = MatchOptions(camera=CameraOptions(north_up=True))
     _, estimator = search_of(broken, match=north)
@@ -136,8 +137,8 @@ def test_only_what_the_user_allows_is_a_rival(broken):
 def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_mirrored(broken):
     truth, _, evidence = broken
     wrong = beside(truth, evidence)
-    others = similar_places(wrong, evidence, evidence.compared_with(wrong), MatchOptions())
-    places = [other.matrix for other in others]
+    others = similar_places(Place(evidence.scene, broken[1], wrong), evidence.compared_with(wrong), MatchOptions())
+    places = [other.place.matrix for other in others]
     assert 0 < len(places) <= rivals._AROUND.n_places
     assert min(apart(broken, place) for place in places) < 3.0  # the place itself is among them
     assert sum(apart(broken, place, wrong) > 500.0 for place in places) > 1
@@ -146,7 +147,7 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
         assert np.linalg.det(item) > 0.0
         assert sampling(item, size) == pytest.approx(sampling(wrong, size), rel=0.1)
         assert evidence.weigh(item) > 0.0
-    assert [other.worth for other in others] == pytest.approx([evidence.weigh(place) for place in places])
+    assert [other.log10_likelihood for other in others] == pytest.approx([evidence.weigh(place) for place in places])
 
 
 @pytest.mark.slow
@@ -156,10 +157,11 @@ def test_similar_places_point_where_the_image_may(broken):
     up = pose(truth, evidence.scene.size).rotation_deg
     reported = MatchOptions(camera=CameraOptions(heading_deg=(up, 5.0)))
     compare = evidence.compared_with(truth)
-    anywhere, there = (similar_places(truth, evidence, compare, match) for match in (MatchOptions(), reported))
+    place = Place(evidence.scene, broken[1], truth)
+    anywhere, there = (similar_places(place, compare, match) for match in (MatchOptions(), reported))
 
     def n_turned(others):
-        away = [pose(other.matrix, evidence.scene.size).rotation_deg - up for other in others]
+        away = [pose(other.place.matrix, evidence.scene.size).rotation_deg - up for other in others]
         return sum(abs((turn + 180.0) % 360.0 - 180.0) > 45.0 for turn in away)
 
     assert n_turned(anywhere) > 0
@@ -198,9 +200,9 @@ def plain(town):
 
 def test_a_place_beyond_doubt_is_not_compared_further(plain, monkeypatch):
     monkeypatch.setattr(rivals, "similar_places", None)
-    standing = stand(plain, plain[0])
-    assert standing.rival is None
-    assert standing.log10_lead == standing.model.log10_odds > rivals._CERTAIN
+    place = stand(plain, plain[0])
+    assert place.rival is None
+    assert place.score > rivals._CERTAIN
 
 
 def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
@@ -209,8 +211,8 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
     wrong = move_about(Homography(truth)(evidence.scene.center), Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
     item, estimator = search_of(plain, wrong)
     asked = Rivals({item: estimator}, Ledger(), NEEDED)
-    standing = asked.standing(item)
-    assert standing is None or standing.log10_lead < NEEDED
+    place = asked.compare(item)
+    assert place is None or place.score < NEEDED
     assert asked([item]) is None
 
 
@@ -218,15 +220,15 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
 def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
     certain = rivals._CERTAIN
     monkeypatch.setattr(rivals, "_CERTAIN", np.inf)
-    standing = stand(plain, plain[0])
-    assert apart(plain, standing.model.matrix) < 2.0
-    assert standing.log10_lead > certain
+    place = stand(plain, plain[0])
+    assert apart(plain, place.matrix) < 2.0
+    assert place.score > certain
 
 
-def test_nothing_met_has_no_standing(plain):
+def test_where_nothing_was_met_nothing_is_compared(plain):
     item, estimator = search_of(plain)
     asked = Rivals({item: estimator}, Ledger(), NEEDED)
-    assert asked.standing(item) is None
+    assert asked.compare(item) is None
     assert asked([item]) is None
 
 
@@ -235,8 +237,8 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     first, estimator = search_of(broken, broken[0])
     empty, other = search_of(broken)
     both = {empty: other, first: estimator}
-    standing = Rivals(both, Ledger(n_reference=866), 1.0).standing(first)
-    half = 0.49 * standing.log10_lead
+    place = Rivals(both, Ledger(n_reference=866), 1.0).compare(first)
+    half = 0.49 * place.score
     assert Rivals(both, Ledger(n_reference=866), half)([empty, first]) is first
     assert Rivals(both, Ledger(n_reference=15_000 * 10**4), half)([empty, first]) is None
     assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, first]) is None
@@ -244,9 +246,13 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_same", [False, True])
-def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, is_same):
+def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, monkeypatch, is_same):
     both = dict(search_of(broken, broken[0]) for _ in range(2))
-    proved = Rivals(both, Ledger(n_reference=866), 1.0, same=lambda *_: is_same)(list(both))
+    asked = Rivals(both, Ledger(n_reference=866), 1.0)
+    best = asked._by_roads(next(iter(both)))
+    monkeypatch.setattr(asked, "_by_roads", lambda _: best)
+    monkeypatch.setattr(Place, "same", lambda *_: is_same)
+    proved = asked(list(both))
     assert (proved is not None) is is_same
 
 
@@ -254,10 +260,10 @@ def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, is_sam
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     item, estimator = search_of(broken, broken[0])
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
-    first, spent = asked.standing(item), item.seconds
+    first, spent = asked.compare(item), item.seconds
     assert spent > 0.0  # it is part of the search
     monkeypatch.setattr(rivals, "similar_places", None)
-    assert asked.standing(item) is first
+    assert asked.compare(item) is first
 
 
 @pytest.mark.slow
@@ -269,7 +275,7 @@ def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_
     looked = []
     monkeypatch.setattr(rivals, "_CERTAIN", certain)
     monkeypatch.setattr(rivals, "_REPEATING", 0.0)
-    monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[4:]) or [])
+    monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[3:]) or [])
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
     assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), *farther]
@@ -295,16 +301,17 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     elsewhere = move_about(Homography(truth)(soft.center), Shift(700.0, 300.0, 0.0, 1.0, 0.0)) @ truth
     estimator = TripleEstimator(soft, index)
     item = Search(estimator)
-    here, there = (Hypothesis.at(matrix, soft, index) for matrix in (truth, truth if is_same else elsewhere))
-    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: Standing(here, None, by_roads))
-    monkeypatch.setattr(Rivals, "_by_picture", lambda *_: Standing(there, None, by_picture))
-    assert Rivals({item: estimator}, Ledger(), NEEDED).standing(item).log10_lead == pytest.approx(lead)
+    here, there = (Place(soft, index, matrix) for matrix in (truth, truth if is_same else elsewhere))
+    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
+    monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
+    assert Rivals({item: estimator}, Ledger(), NEEDED).compare(item).score == pytest.approx(lead)
 
 
 def test_a_hint_never_lowers_the_lead_by_the_picture(plain, monkeypatch):
     truth, index, evidence = plain
     x, y = Homography(truth)(evidence.scene.center)
     hinted = TripleEstimator(evidence.scene, index, near=(x, y, 100.0))
-    hinted.verified.append(Hypothesis.at(truth, evidence.scene, index))
-    monkeypatch.setattr(Rivals, "_seen", lambda _, at, best, *__: Standing(best, None, 3.0 if at.near is None else 1.0))
-    assert Rivals({}, Ledger(), NEEDED)._by_picture(hinted).log10_lead == 3.0
+    hinted.verified.append(Place(evidence.scene, index, truth))
+    lead = lambda _, at, best, *__: best.but(score=3.0 if at.near is None else 1.0)  # noqa: E731
+    monkeypatch.setattr(Rivals, "_compare_by_picture", lead)
+    assert Rivals({}, Ledger(), NEEDED)._by_picture(hinted).score == 3.0

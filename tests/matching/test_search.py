@@ -1,4 +1,4 @@
-"""The search loop, with a toy: guess a secret integer; models are (answer, score) pairs."""
+"""The search loop, with a toy: guess a secret integer; models are (answer, score) pairs, and settle to these."""
 
 import time
 from dataclasses import dataclass, field
@@ -24,14 +24,14 @@ class Toy:
     def stages(self):
         yield iter(self.plan)
 
-    def score(self, model):
+    def settle(self, model):
         time.sleep(self.seconds)
         self.scored.append(model[0])
-        return model[1]
+        return model
 
 
 def answer(result):
-    return None if result.best is None else result.best[0]
+    return result.best
 
 
 @pytest.mark.parametrize("plan", [[], [[]], [[], []]])
@@ -130,7 +130,7 @@ def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
     parts = together(*toys)
     assert [len(toy.scored) for toy in toys] == [3, 3, 3]
     assert [part.stopped for part in parts] == ["elsewhere", "accepted", "elsewhere"]
-    assert parts[1].best == (17, 30.0)
+    assert parts[1].best == 17
 
 
 def test_no_part_goes_to_the_next_stage_before_the_others():
@@ -138,7 +138,7 @@ def test_no_part_goes_to_the_next_stage_before_the_others():
     toys[0].plan = [[(0, 1.0)]] * 3
     order = []
     for n, toy in enumerate(toys):
-        toy.score = lambda model, n=n: order.append(n) or model[1]
+        toy.settle = lambda model, n=n: order.append(n) or model
     assert [item.stopped for item in together(*toys)] == ["exhausted", "exhausted"]
     assert order == [0, 1, 0, 1, 0]
 

@@ -1,6 +1,6 @@
 """Parts are swept together: an intersection of the query on all of them, and the best of what it proposes goes on."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.growing import Hypothesis, SharedSweeps
+from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.index import build_index
+from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import Rivals
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions
@@ -24,7 +25,7 @@ class Part:
     placed: list[list[int]]
     index: object = None
     screened: list[int] = field(default_factory=list)
-    whole: list[Hypothesis] = field(default_factory=list)
+    whole: list[Place] = field(default_factory=list)
 
     def allow(self, proposals):
         return np.ones(len(proposals.placed), bool)
@@ -35,13 +36,20 @@ class Part:
 
     def follow_up(self, proposals, chosen):
         for item in proposals.placed[chosen]:
-            yield Hypothesis(np.eye(3), float(item), chosen)
+            yield Place(None, self.index, np.eye(3), float(item))
 
     def enough(self):
         return False
 
     def known_places(self):
         return self.whole
+
+
+class Shard:
+    """Of a map of which all others are."""
+
+    def is_shard_beside(self, other):
+        return True
 
 
 class Plan:
@@ -60,8 +68,8 @@ def proposals_of(anchor, placed):
     return Proposals(anchor, np.arange(n), np.zeros((n, 2), int), np.zeros((n, 4)), np.array(placed, int), 1, n, n)
 
 
-def swept(parts, same_place=None):
-    sweeps = SharedSweeps(None, CameraOptions(), same_place)
+def swept(parts):
+    sweeps = SharedSweeps(None, CameraOptions())
     sweeps.members += parts
     return sweeps, Plan(parts)
 
@@ -107,12 +115,12 @@ def test_each_part_takes_what_grew_on_it_in_its_own_time():
 def test_a_place_on_ground_that_shards_share_is_verified_once(monkeypatch):
     monkeypatch.setattr(growing, "MAX_VERIFIED", 4)
 
-    def same_place(first, a, other, b):
-        return a.support // 10 == b.support // 10
-
+    monkeypatch.setattr(Place, "same", lambda one, other: one.support // 10 == other.support // 10)
     parts = [Part([[31, 19]]), Part([[52, 45, 18]]), Part([[60, 11]])]
-    parts[2].whole.append(Hypothesis(np.eye(3), 50.0, np.zeros(1, int)))
-    sweeps, sweep = swept(parts, same_place)
+    for part in parts:
+        part.index = Shard()
+    parts[2].whole.append(Place(None, parts[2].index, np.eye(3), 50.0))
+    sweeps, sweep = swept(parts)
     found = [sorted(supports(next(sweeps.rounds(part, sweep)))) for part in parts]
     assert found == [[19.0, 31.0], [45.0], [60.0]]
 
@@ -147,9 +155,10 @@ def test_a_place_is_found_on_any_of_many_towns(towns):
 @pytest.mark.slow
 def test_a_twin_on_another_part_is_met(towns):
     networks, indexes = towns
+    twin = replace(indexes[1], meta={**indexes[1].meta, "origin": [400_000.0, 4_690_000.0]})
     parts = search_all(
         scene_of(look(networks[1], TRUTH)),
-        [*indexes, indexes[1]],
+        [*indexes, twin],
         MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=False),
     )
     assert "accepted" not in [part.stopped for part in parts]

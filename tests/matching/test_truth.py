@@ -11,8 +11,8 @@ from worlds.scenes import PLANE, random_network
 from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place
-from roadgeo.matching.events import Events
 from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.truth import _TruePlace, tell_truth
 
@@ -63,11 +63,11 @@ def place(x, y):
 @pytest.mark.parametrize(
     ("best", "answer", "lost_at", "said"),
     [
-        (2.5, REFUSED, "odds", "reached log10 odds 2.5, 3 are needed"),
-        (9.0, REFUSED, "margin", "reached log10 odds 9.0, but another place as much"),
-        (9.0, place(5000.0, 500.0), "margin", "but another place as much"),
-        (9.0, place(520.0, 500.0), None, "reached log10 odds 9.0 and was located"),
-        (-1.0, place(520.0, 500.0), None, "odds -1.0, but leads any other place where these streets repeat"),
+        (2.5, REFUSED, "odds", "reached a score of 2.5, 3 are needed"),
+        (9.0, REFUSED, "rival", "reached a score of 9.0, but another place as much"),
+        (9.0, place(5000.0, 500.0), "rival", "but another place as much"),
+        (9.0, place(520.0, 500.0), None, "reached a score of 9.0 and was located"),
+        (-1.0, place(520.0, 500.0), None, "score of -1.0, but leads any other place where these streets repeat"),
     ],
 )
 def test_what_was_measured_is_weighed(estimator, best, answer, lost_at, said):
@@ -81,6 +81,6 @@ def test_off_the_map_nothing_else_counts(estimator):
     assert (story.lost_at, story.said) == ("map", "the true place lies off the map that was searched")
 
 
-def test_where_nothing_was_searched_it_is_said():
-    story = tell_truth((-71.0, 42.0), Events(kept=True), REFUSED, LocateOptions())
+def test_where_nothing_was_searched_it_is_said(estimator):
+    story = tell_truth((-71.0, 42.0), Searched(estimator.index), REFUSED, LocateOptions())
     assert (story.lost_at, story.said) == ("map", "the true place: nothing was searched")

@@ -8,9 +8,12 @@ from worlds.scenes import PLANE, camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.location import Reason, Seconds
+from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.index import build_index
-from roadgeo.matching.methods import Fit, Found
+from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.place import Place, Weight
+from roadgeo.matching.refinement import Refined
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 
@@ -28,6 +31,14 @@ def town():
     return build_index(random_network(1, 2000.0))
 
 
+def at(query, index, matrix, score, likelihood, covariance=None, agreeing=0.8):
+    """A place as a search returns it."""
+    refined = Refined(matrix, np.ones(4), 1.0, np.eye(8) / 2.0 if covariance is None else covariance)
+    place = Place(query.scene, index, matrix, refined=refined, score=score, by=Weight(likelihood, 1.0))
+    vars(place).update(agreement=Agreement(0.9, 0.9), agreeing=agreeing)
+    return place
+
+
 @pytest.fixture
 def searched(query, town):
     """Return what a search of a reference of that name found, at these odds and eastings in metres.
@@ -37,20 +48,14 @@ def searched(query, town):
 
     def found(
         name: str, *places: tuple[float, float], tried: int = 100, likelihood: float | None = None, **reported
-    ) -> Found:
+    ) -> Searched:
         index = replace(town, meta={**town.meta, "name": name, "attribution": "© all"})
-        nobody = np.full(len(query.scene.intersections), -1)
-        fits = [
-            Fit(
-                index, camera((east, 0.0), SIZE), nobody, np.zeros(len(nobody)), 0.9, odds, -np.inf, np.ones(4),
-                agreement=0.8,
-            )
-            for odds, east in places
-        ]  # fmt: skip
-        if fits:
-            fits[0] = replace(fits[0], log10_likelihood=fits[0].log10_odds if likelihood is None else likelihood)
+        best = [at(query, index, camera((east, 0.0), SIZE), score, -np.inf) for score, east in places]
+        if best:
+            explained = best[0].score if likelihood is None else likelihood
+            best[0] = best[0].but(by=Weight(explained, 1.0), rival=best[1] if len(best) > 1 else None)
         reported = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **reported}
-        return Found(index, tuple(fits), n_tried=tried, n_searched=len(index), **reported)
+        return Searched(index, tuple(best[:1]), n_tried=tried, n_searched=len(index), **reported)
 
     return found
 
@@ -102,7 +107,7 @@ def test_places_of_different_scales_are_compared_by_what_they_explain_of_the_sam
     """Laid five times as large, a mask has five times as much road that may agree by chance."""
     here, large = searched("a", (20.0, 0.0), likelihood=100.0), searched("b", (-8.0, 30_000.0), likelihood=180.0)
     here, large = (
-        replace(item, fits=tuple(replace(fit, statement_px=px) for fit in item.fits))
+        replace(item, places=tuple(place.but(by=place.by._replace(statement_px=px)) for place in item.places))
         for item, px in ((here, 600.0), (large, 120.0))
     )
     best = judge(query, large, here)
@@ -111,7 +116,8 @@ def test_places_of_different_scales_are_compared_by_what_they_explain_of_the_sam
 
 def test_places_that_repeat_are_told_whatever_another_map_holds(query, searched):
     pair = searched("b", (0.5, 0.0), (-0.5, 5000.0), likelihood=30.0)
-    pair = replace(pair, fits=tuple(replace(fit, agreement=0.95) for fit in pair.fits))
+    for place in pair.compared:
+        vars(place)["agreeing"] = 0.95
     assert judge(query, pair).status == "ambiguous"
     assert judge(query, searched("a", (-3.0, 30_000.0), likelihood=1.0), pair).status == "ambiguous"
 
@@ -132,8 +138,9 @@ def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
 def test_where_streets_repeat_both_places_are_told(query, searched, agreements, status: str) -> None:
     """Neither explains more than the other, so that neither has odds."""
     found = searched("a", (-2.0, 0.0), (-2.1, 5000.0))
-    fits = tuple(replace(fit, agreement=rate) for fit, rate in zip(found.fits, agreements, strict=True))
-    best = judge(query, replace(found, fits=fits))
+    for place, rate in zip(found.compared, agreements, strict=True):
+        vars(place)["agreeing"] = rate
+    best = judge(query, found)
     assert best.status == status
     assert ("streets repeat there: 95% agrees at one, 90% at another" in best.reason) == (status == "ambiguous")
 
@@ -154,10 +161,7 @@ def test_a_refusal_tells_the_odds_of_the_best_and_of_the_next_place(query, searc
 def test_a_given_focal_length_is_used_for_the_tilt(query, town):
     """A homography alone tells the tilt to a degree at best, with the focal length it tells it to hundredths."""
     truth = camera((1000.0, 1000.0), SIZE, 1.0, tilt_deg=24.0, azimuth_deg=70.0, focal_px=900.0)
-    nobody = np.full(len(query.scene.intersections), -1)
-    found = Found(
-        town, (Fit(town, truth, nobody, np.zeros(len(nobody)), 0.9, 20.0, 40.0, np.ones(4)),), "accepted", n_tried=1
-    )
+    found = Searched(town, (at(query, town, truth, 20.0, 40.0),), "accepted", n_tried=1)
     match = LocateOptions().match
     known = replace(match, camera=CameraOptions(focal_px=900.0))
     seen = judge(query, found, match=known)
@@ -250,7 +254,8 @@ def test_half_a_place_is_not_located(query, searched, along_m, status):
     found = searched("a", (20.0, 0.0))
     east = np.tile([1.0, 0.0], 4)
     covariance = along_m**2 * np.outer(east, east) + np.eye(8)
-    found = replace(found, fits=tuple(replace(fit, corner_covariance_m2=covariance) for fit in found.fits))
+    place = found.places[0]
+    found = replace(found, places=(place.but(refined=replace(place.refined, corner_covariance_m2=covariance)),))
     answer = judge(query, found)
     assert answer.status == status
     if status == "ambiguous":
@@ -258,9 +263,3 @@ def test_half_a_place_is_not_located(query, searched, along_m, status):
         assert answer.reason.startswith("only half a place is known: the middle lies within +-200 m along 90 degrees")
         assert answer.center is not None
         assert answer.to_dict()["center_error"]["along_m"] == pytest.approx(100.0, rel=0.01)
-
-
-def test_places_that_are_only_shown_make_no_answer(query, searched):
-    found = searched("a", (5.0, 0.0))
-    refused = judge(query, replace(found, fits=(), further=found.fits))
-    assert (refused.status, refused.alternatives) == ("not_located", ())
