@@ -209,7 +209,7 @@ def test_small_pixels_are_not_looked_for_on_the_coarse_map(region, main_roads):
     fresh = open_reference(region.path)
     query, _, options = wide_view(main_roads, gsd_m=(0.3, 1.5))
     options = replace(options, effort="quick")
-    assert search_references(query, fresh.parts, options, 60.0)[0].fits == ()
+    assert search_references(query, fresh.parts, options, 60.0)[0].places == ()
     assert set(opened(fresh)) == {one.name for one in fresh.manifest.filled}
 
 
