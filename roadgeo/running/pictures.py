@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Iterator
@@ -21,6 +22,9 @@ from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
 __all__ = ["as_file", "pixels_of", "read_picture"]
 
+_LOG = logging.getLogger(__name__)
+
+_SUBFILE_TYPE = 254  # a tag of TIFF
 #: Names of the axes of a picture, and of the columns where they are degrees.
 _ROWS, _DEGREES = {"y", "row", "rows", "lat", "latitude"}, {"lon", "longitude"}
 _COLUMNS = {"x", "column", "col"} | _DEGREES
@@ -61,9 +65,14 @@ def read_picture(picture: Any) -> str | AnyArray:
 def pixels_of(picture: Any) -> dict[str, Any]:
     """Return what xarray says of a picture, as fields of `ReadOptions`: names of bands, shape of pixels, order of rows.
 
+    PIL states the shape of pixels by their resolution.
     Its `attrs["long_name"]` or the coordinates of its third axis are names. Axes called lat and lon, or a geographic
     CRS as rioxarray writes it, are in degrees.
     """
+    if hasattr(picture, "getbands"):  # PIL
+        stated = (picture.info.get(name) for name in ("dpi", "jfif_density", "aspect"))
+        across, down = next(filter(None, stated), (1.0, 1.0))
+        return {"aspect": stretch_of(float(down), float(across))}
     if not (hasattr(picture, "dims") and hasattr(picture, "coords")):
         return {}
     rows, columns = (_axis(picture, names) for names in (_ROWS, _COLUMNS))
@@ -136,6 +145,8 @@ def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
 
 
 def _read_pil(image: Any) -> AnyArray:
+    if getattr(image, "tag_v2", {}).get(_SUBFILE_TYPE, 0) & 1:
+        _LOG.warning("the picture is a thumbnail by its tags; `seek` the page that you mean, or give the file's path")
     bands = image.getbands()
     if bands[0] == "P" and not are_labels(np.asarray(image)):
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")

@@ -27,7 +27,14 @@ from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.crs import file_in_bytes
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
-from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright, tiff_values, turn_upright
+from roadgeo.storage.orientation import (
+    UPRIGHT,
+    read_orientation,
+    stored_from_upright,
+    tiff_pages,
+    tiff_values,
+    turn_upright,
+)
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -79,7 +86,8 @@ _GEO_TEXT = 34737  # tag of GeoTIFF
 
 #: Endings of raw photographs, and tags of TIFF by which they are known: what of them GDAL reads is a thumbnail.
 RAW = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw")
-_DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE = 50706, 330, 254
+_DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE, _OLD_SUBFILE_TYPE = 50706, 330, 254, 255
+_IN_PART = 0b101  # bits of a type: a reduced picture, a mask of transparency
 _CANON = b"CR"  # at byte 8
 _PAGE = re.compile(r"GTIFF_DIR:(\d+):(.+)", re.DOTALL)  # GDAL's name of a page
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
@@ -137,6 +145,8 @@ def open_raster(
             _require_chunks(Path(path), name)
         if page and drivers != ["GTiff"]:
             raise MaskError(f"{name}: holds no pages; only TIFFs do: leave --page out")
+        if drivers == ["GTiff"] and not page and (number := _first_whole_page(Path(path))) > 1:
+            page = _PAGE.fullmatch(name_page(os.fspath(path), number))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
@@ -290,6 +300,14 @@ def _is_raw(path: Path, head: bytes) -> bool:
         is_thumbnail = kind is not None and int.from_bytes(kind[1][:4], "little" if kind[2] == "<" else "big") & 1
         return head[8:10] == _CANON or version is not None or bool(is_thumbnail and subs)
     return False
+
+
+def _first_whole_page(path: Path) -> int:
+    """Return the first page of a TIFF, counted from 1, that is neither a reduced picture nor a mask; else 1."""
+    with path.open("rb") as file, contextlib.suppress(struct.error):
+        kinds = zip(*(tiff_pages(file, tag) for tag in (_SUBFILE_TYPE, _OLD_SUBFILE_TYPE)), strict=False)
+        return next((number for number, (kind, old) in enumerate(kinds, 1) if not (kind & _IN_PART or old == 2)), 1)
+    return 1
 
 
 def name_page(path: str, page: int | None) -> str:

@@ -24,6 +24,7 @@ from roadgeo.errors import MaskError, OutputError
 from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import open_mask, read_mask
+from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.storage.gdal import CONSENT, skip_drivers
 from roadgeo.storage.rasters import name_page, open_raster, page_of, raster_size, writing_raster
 
@@ -519,3 +520,48 @@ def test_pages_of_a_tiff(tmp_path: Path) -> None:
         read_mask(name_page(str(tmp_path / "a.png"), 2))
     with open_raster(tmp_path / "a.png") as dataset:
         assert page_of(dataset) == ""
+
+
+def save_pages(path: Path, kinds: tuple[int, ...], sizes: tuple[int, ...], order: str, tag: int) -> Path:
+    """Write a TIFF of pages that say by a tag what they are."""
+    pages = [PIL.Image.fromarray(np.full((size, size), k, np.uint8)) for k, size in enumerate(sizes)]
+    pages[0].save(path, save_all=True, append_images=pages[1:], tiffinfo={tag: 9}, big_tiff="big" in order)
+    content, at = bytearray(path.read_bytes()), 0
+    for kind in kinds:
+        at = content.index(struct.pack("<H", tag) + (b"\x04" if tag == 254 else b"\x03"), at)
+        value = at + (12 if "big" in order else 8)
+        assert content[value] == 9
+        content[value], at = kind, value
+    path.write_bytes(content)
+    return path
+
+
+THUMB, WHOLE = 96, 200
+
+
+@pytest.mark.parametrize(
+    ("kinds", "sizes", "tag", "page"),
+    [
+        ((1, 0), (THUMB, WHOLE), 254, 2),
+        ((1, 1, 0), (64, THUMB, WHOLE), 254, 3),
+        ((4, 0), (WHOLE, WHOLE), 254, 2),  # its mask comes first
+        ((3, 2), (THUMB, WHOLE), 254, 2),  # of a document of several pages
+        ((2, 1), (THUMB, WHOLE), 255, 2),  # as TIFF 5.0 says it
+        ((0, 1), (WHOLE, THUMB), 254, 1),
+        ((1, 1), (THUMB, WHOLE), 254, 1),
+    ],
+)
+@pytest.mark.parametrize("order", ["small", "big"])
+def test_a_thumbnail_in_front_is_no_picture(
+    kinds: tuple[int, ...], sizes: tuple[int, ...], tag: int, page: int, order: str, tmp_path: Path
+) -> None:
+    path = save_pages(tmp_path / "a.tif", kinds, sizes, order, tag)
+    size = (sizes[page - 1],) * 2
+    assert raster_size(path) == size
+    with open_raster(path) as dataset, open_photograph(path) as photograph:
+        assert dataset.shape == (photograph.height, photograph.width) == size
+        assert dataset.read(1)[0, 0] == page - 1
+        assert (f"page {page}" in page_of(dataset)) == (f"page {page}" in photograph.page) == (page > 1)
+    if sizes[0] >= 64:
+        with open_raster(name_page(str(path), 1)) as dataset:  # which one may ask for
+            assert dataset.shape == (sizes[0],) * 2
