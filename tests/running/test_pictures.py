@@ -53,12 +53,14 @@ def test_a_picture_of_pil_is_turned_upright(tmp_path: Path, kind: str, orientati
 def test_a_picture_of_pil_has_the_pixels_that_its_resolution_states(tmp_path: Path, kind: str) -> None:
     for dpi, aspect in (((100, 200), pytest.approx(2.0, rel=0.01)), ((72, 72), None), ((0, 0), None)):
         Image.fromarray(GREY).save(tmp_path / f"a.{kind}", dpi=dpi)
-        assert pixels_of(Image.open(tmp_path / f"a.{kind}")) == {"aspect": aspect}
+        with Image.open(tmp_path / f"a.{kind}") as image:
+            assert pixels_of(image) == {"aspect": aspect}
 
 
 def test_a_thumbnail_of_pil_is_mentioned(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     Image.fromarray(GREY).save(tmp_path / "a.tif", tiffinfo={254: 1})
-    read_picture(Image.open(tmp_path / "a.tif"))
+    with Image.open(tmp_path / "a.tif") as image:
+        read_picture(image)
     assert "is a thumbnail" in caplog.text
 
 
