@@ -1,4 +1,4 @@
-"""A trained network as ONNX in 8 bits, calibrated, with the metadata that QGIS Deepness and GeoDeep read.
+"""A trained network as ONNX in 8 bits, calibrated, with the metadata that QGIS Deepness reads.
 
     python export.py DATA runs/all.pt roads.onnx --held-out 0 runs/fold0.pt
 
@@ -29,7 +29,7 @@ from training import load, probabilities
 
 __all__ = ["METADATA", "TILE", "calibrate", "export", "in_32_bits", "measure_calibration"]
 
-TILE = 800  # px: two of them, overlapping by 100, cover 1500; a fixed size, for GeoDeep knows no other
+TILE = 800  # px: two of them, overlapping by 100, cover 1500; other multiples of 32 px do as well
 OPSET = 17
 
 METADATA = {
@@ -37,13 +37,10 @@ METADATA = {
     # One output channel: Deepness counts it as two classes, which the threshold separates.
     "class_names": {"0": "not_road", "1": "road"},
     "resolution": 100,  # cm per pixel
-    "tile_size": TILE,
     "tiles_size": TILE,
     "tiles_overlap": 12.5,  # percent
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
-    "ways": 2,  # roadgeo's own key: shown each tile turned by half as well, the mean counts
-    "any_size": True,  # roadgeo's own: any tile does whose sides are multiples of 32; fixed in the file for GeoDeep
     "version": "6",
     "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel; painted scenes on "
     "streets of OpenStreetMap; encoder: ImageNet",
@@ -52,7 +49,7 @@ METADATA = {
 
 
 def export(network: RoadNet, tiles: list[Tile], path: Path, threshold: float = 0.5) -> Path:
-    """Write the network as ONNX: (1, 3, 800, 800) RGB, 0..1, to the probability of road, (1, 1, 800, 800).
+    """Write the network as ONNX: (1, 3, H, W) RGB, 0..1, to the probability of road, (1, 1, H, W).
 
     What it runs on in 8 bits is measured on the photographs of the tiles. Above the threshold masks show road.
     """
@@ -112,7 +109,7 @@ def _print_reliability(seen: NDArray[np.float32], road: NDArray[np.bool_]) -> No
 def _write(graph: onnx.GraphProto, path: Path, threshold: float) -> Path:
     """Write a graph with its sizes and the metadata."""
     for port, channels in ((graph.input[0], 3), (graph.output[0], 1)):
-        sizes = helper.make_tensor_type_proto(onnx.TensorProto.FLOAT, (1, channels, TILE, TILE))
+        sizes = helper.make_tensor_type_proto(onnx.TensorProto.FLOAT, (1, channels, "height", "width"))
         port.type.CopyFrom(sizes)  # the exporter loses them where features are made larger
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
     helper.set_model_props(

@@ -321,8 +321,8 @@ _SHARED = {
         default="deflate", show_default=True, rare=True),
     "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
     "segmenter": row("--segmenter", "NAME|MODEL.onnx", IMAGE,
-        "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness, GeoDeep "
-        "or STAC describe them. Default: the model that ships.",
+        "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness or "
+        "STAC describe them. Default: the model that ships.",
         type=Plugin(partial(installed, "roadgeo.segmenters"), file_ending=".onnx"), rare=True),
     "class_name": row("--class class_name", "NAME|N", IMAGE,
         "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True),

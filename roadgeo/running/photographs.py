@@ -65,7 +65,7 @@ class Look:
     finer : float
         How many times finer than that the photograph is shown.
     ways : int or None
-        Number of ways in which a model sees it; None: the number on its card.
+        Number of ways in which a model sees it; None: two for the model that ships, one for others.
     as_shown : bool
         In one way, where it was shown at that scale already, but not at the next finer one.
     lower : bool
@@ -101,6 +101,7 @@ class Frame:
         """Choose the grid and the scales; where no scale is known, the photograph is shown to the model for that."""
         self.photograph, self.reading, self.gsd_m, self.say = photograph, reading, gsd_m, say
         self.network = load_model(reading.segmenter, reading.class_name, reading.threads)
+        self.ways = 1 if reading.segmenter else _WAYS
         #: Probability of road by scale and number of ways.
         self._seen: dict[tuple[float, int], ProbabilityMap] = {}
         k = max(1, math.ceil(math.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS)))
@@ -131,13 +132,13 @@ class Frame:
         """Return the best scale's look, other scales, the photograph in more ways, and a lower threshold at the best.
 
         The model is shown it in one way first where that was done already, but not at the next finer scale, and where
-        there is much to show. Beyond scales that were tried it is shown in more ways only if its card asks for fewer:
+        there is much to show. Beyond scales that were tried a model of others is shown it in more ways:
         of 60 photographs whose scale was unknown none was located so, and it was half of a refusal's time. Where one
         scale is known, the two scales that were shown together are looked at alone as well.
         """
         best = self.scale(0)
         in_one = self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS
-        has_more = (in_one and self.n_scales == 1) or self.network.card.ways < _WAYS
+        has_more = (in_one and self.n_scales == 1) or self.ways < _WAYS
         looks = [Look(ways=1 if in_one else None)]
         most = _WAYS if has_more else looks[0].ways
         looks += [Look(rank, as_shown=True) for rank in range(1, self.n_scales)]
@@ -164,7 +165,7 @@ class Frame:
 
     def see(self, scale: float, ways: int | None) -> ProbabilityMap:
         """Return the probability of road on the grid."""
-        return self._see(scale, ways or self.network.card.ways).resized(self.grid)
+        return self._see(scale, ways or self.ways).resized(self.grid)
 
     def _see(self, scale: float, ways: int) -> ProbabilityMap:
         """Return what the model sees, not much finer than the grid."""

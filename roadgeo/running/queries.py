@@ -124,7 +124,7 @@ class FirstLook:
 def look_once(
     path: str | AnyArray, gsd_m: tuple[float, float] | None, reading: ReadOptions, say: Say = say_nothing
 ) -> FirstLook:
-    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as the model's card asks.
+    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as its first look.
 
     Parameters
     ----------

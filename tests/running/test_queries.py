@@ -113,21 +113,34 @@ def test_the_second_look_shows_the_photograph_more_ways(
     assert not any("ways" in item for item in taken[:1] + taken[2:])
 
 
+def light(folder: Path) -> Path:
+    """A model that sees roads where a picture is light."""
+    photographs.load_model.cache_clear()
+    return brightness_model(folder / "light.onnx", size=256, props={"class_names": {0: "ground", 1: "road"}})
+
+
 @pytest.mark.parametrize(("ways", "expected"), [(1, [(0.5, 1)]), (2, [(1.0, 1), (0.5, 1)])])
-def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
-    tmp_path: Path, photo: Path, shown: list[tuple[float, int]], ways: int, expected: list[tuple[float, int]]
+def test_the_first_look_shows_the_photograph_in_two_ways_to_the_model_that_ships(
+    tmp_path: Path,
+    photo: Path,
+    shown: list[tuple[float, int]],
+    ways: int,
+    expected: list[tuple[float, int]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    props = {"class_names": {0: "ground", 1: "road"}, "ways": ways}
-    model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
-    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenter=str(model)))
+    model = light(tmp_path)
+    if ways == 2:
+        monkeypatch.setattr(photographs, "DEFAULT_MODEL", model)
+    segmenter = "" if ways == 2 else str(model)
+    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenter=segmenter))
+    photographs.load_model.cache_clear()
     assert shown == expected
 
 
 def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
     tmp_path: Path, photo: Path, shown: list[tuple[float, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    props = {"class_names": {0: "ground", 1: "road"}, "ways": 2}
-    model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
+    monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
     taken: list[str] = []
 
     def take(looks, see, *_):  # type: ignore[no-untyped-def]
@@ -139,7 +152,8 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
 
     monkeypatch.setattr(photographs, "locate_looks", take)
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: NOTHING, 1.0: None, 2.0: None})
-    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenter=str(model)))
+    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always"))
+    photographs.load_model.cache_clear()
     assert taken == ["0", "1", "2", "0, a lower threshold"]
     # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
     assert shown == [(1.0, 2), (2.0, 2)]
@@ -149,13 +163,14 @@ def test_a_scale_that_was_tried_alone_is_not_shown_finer(
     tmp_path: Path, photo: Path, shown: list[tuple[float, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was seen at the finest scale that is worth a look goes with the coarser one; a finer one would be dear."""
-    model = brightness_model(tmp_path / "light.onnx", size=256, props={"ways": 2})
+    monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: dict.fromkeys((0.5, 0.25, 0.125), NOTHING))
-    reading = ReadOptions(segment="always", segmenter=str(model))
+    reading = ReadOptions(segment="always")
     with photographs.open_frame(str(photo), reading, (0.0, np.inf), lambda *_: None) as frame:
         for look in frame.looks():
             with suppress(MaskError):
                 frame.look(look)
+    photographs.load_model.cache_clear()
     assert not shown
 
 

@@ -1,14 +1,12 @@
 """The description of a model that is needed to run it, from its own metadata or the STAC item beside it.
 
-Conventions: QGIS Deepness and GeoDeep keep JSON strings in an ONNX file's `metadata_props`
-(https://qgis-plugin-deepness.readthedocs.io, "Adding metadata to ONNX model"; https://github.com/uav4geo/GeoDeep,
-`inference.py`); the STAC Machine Learning Model extension describes a model in MODEL.json beside MODEL.onnx
-(https://github.com/stac-extensions/mlm).
+Conventions: QGIS Deepness keeps JSON strings in an ONNX file's `metadata_props`
+(https://qgis-plugin-deepness.readthedocs.io, "Adding metadata to ONNX model"); the STAC Machine Learning Model
+extension describes a model in MODEL.json beside MODEL.onnx (https://github.com/stac-extensions/mlm).
 """
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -19,10 +17,7 @@ from typing import Any
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
 
-__all__ = ["MAX_WAYS", "TILE_STEP", "ModelCard", "channels_come_last", "read_card", "size_of"]
-
-#: Number of ways in which a tile can be shown to a model.
-MAX_WAYS = 4
+__all__ = ["TILE_STEP", "ModelCard", "channels_come_last", "read_card", "size_of"]
 
 _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
 #: Free input sizes are made multiples of this, as encoders with five reductions ask for.
@@ -58,8 +53,6 @@ class ModelCard:
         Subtracted from, and divided out of RGB values between 0 and 1.
     threshold : float
         Probabilities above it are road.
-    ways : int
-        Number of ways in which each tile is shown at the first look, see `queries`: more than one, if it is fast.
     output : str
         The output that shows roads.
     channels : tuple of int
@@ -79,7 +72,6 @@ class ModelCard:
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
     threshold: float
-    ways: int
     output: str
     channels: tuple[int, ...]
     gives_classes: bool
@@ -131,7 +123,6 @@ def _make_card(model: OnnxModel, metadata: dict[str, Any], class_name: str | Non
         mean=_triple(metadata.get("mean", 0.0), "mean"),
         std=_triple(metadata.get("std", 1.0), "standard deviation"),
         threshold=_within(metadata.get("threshold", 0.5), 0.0, 1.0, "threshold"),
-        ways=int(_within(metadata.get("ways", 1), 1, MAX_WAYS, "ways")),
         output=output.name,
         channels=channels,
         gives_classes=gives_classes,
@@ -223,33 +214,18 @@ def _is_road(name: str) -> bool:
 
 
 def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
-    """Read `metadata_props` as Deepness and GeoDeep write them; `ways` is roadgeo's own."""
+    """Read `metadata_props` as Deepness writes them."""
     read: dict[str, tuple[str, Callable[[Any], Any]]] = {
         "model_type": ("model_type", str),
-        "names": ("classes", _classes),
         "class_names": ("classes", _classes),
         "resolution": ("resolution_m", lambda centimetres: float(centimetres) / 100.0),
-        "tile_size": ("tile", int),
         "tiles_size": ("tile", int),
         "standardization_mean": ("mean", lambda values: values),
         "standardization_std": ("std", lambda values: values),
         "tiles_overlap": ("overlap", lambda percent: float(percent) / 100.0),
         "seg_thresh": ("threshold", float),
-        "ways": ("ways", int),
     }
-    return {name: make(_value(props[key])) for key, (name, make) in read.items() if key in props}
-
-
-def _value(text: str) -> Any:
-    """Parse JSON or, as old models have it, a Python literal; anything else is text."""
-    try:
-        return json.loads(text)
-    except ValueError:
-        pass
-    try:
-        return ast.literal_eval(text) if len(text) < 10_000 else text
-    except (ValueError, SyntaxError, MemoryError):
-        return text
+    return {name: make(json.loads(props[key])) for key, (name, make) in read.items() if key in props}
 
 
 def _classes(names: Any) -> dict[int, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, Float32Array
 from roadgeo._text import visible
 from roadgeo.errors import ModelError
-from roadgeo.sources.segmentation.card import ModelCard, channels_come_last, read_card, size_of
+from roadgeo.sources.segmentation.card import TILE_STEP, ModelCard, channels_come_last, read_card, size_of
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, open_onnx
 
 __all__ = ["DEFAULT_MODEL", "Network", "load_network"]
@@ -175,6 +175,9 @@ def _what_is_seen(network: Network) -> tuple[tuple[int, int], tuple[int, int]]:
     determines the size of its pixels.
     """
     height, width = network.card.tile
+    small = np.zeros((2 * TILE_STEP, 2 * TILE_STEP, 3), np.uint8)
+    if network.card.any_size and network._run(small).shape[1:] == small.shape[:2]:
+        return (height, width), (height, width)
     moved = max(width // 2 // _STRIDES[-1], 1) * _STRIDES[-1]
     _, picture = _noise(height, width + moved)
     here = network._run(np.ascontiguousarray(picture[:, :width]))

@@ -33,7 +33,6 @@ _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 _ORT = b"ORTM"  # where the file of another format has it, which onnxruntime would read instead
 _STRING = 8  # of TensorProto.DataType
-_ANY_SIZE = b"any_size"  # a key of our own in the metadata, for GeoDeep wants an input of a fixed size
 
 #: The checked parts of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
 _SCHEMA = (
@@ -155,7 +154,6 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     last = {
         _text(output): _text(name) for node in model.graph[0].node for output in node.output for name in node.operator
     }
-    content = _of_any_size(model) or content
     del model  # as large as the file
     try:
         session = _open_session(content, threads)
@@ -192,17 +190,6 @@ def _require_network(content: bytes) -> Any:
     for node in graph.node:
         _require_plain(node)
     return model
-
-
-def _of_any_size(model: Any) -> bytes:
-    """Return a file whose metadata say that its input may be of any size, with such an input; nothing of any other."""
-    if not any(_ANY_SIZE in entry.key and b"true" in entry.value for entry in model.metadata):
-        return b""
-    kinds = (kind for port in model.graph[0].input for kind in port.type)
-    for shape in (shape for kind in kinds for numbers in kind.tensor for shape in numbers.shape):
-        for side in shape.side[2:]:
-            side.ClearField("length")
-    return bytes(model.SerializeToString())
 
 
 def _require_plain(node: Any) -> None:

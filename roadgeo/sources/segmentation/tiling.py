@@ -24,7 +24,7 @@ __all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
 MAX_MAP_PIXELS = 1_000_000_000
 
 #: Steps down and to the right by which a tile is read, in the order in which the ways are taken.
-_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))  # MAX_WAYS of them
+_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 #: No model is surer than this where ways are averaged: one of them would outweigh all others.
 _SURE = np.float32(1e-4)
 _LONGER = 4 / 3  # a picture that much longer than a tile is one tile, if it may be: two would mostly overlap

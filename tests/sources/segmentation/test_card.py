@@ -95,12 +95,6 @@ def test_a_single_channel_is_the_last_of_the_classes(tmp_path: Path, class_name:
         card_of(path, "sea")
 
 
-def test_metadata_of_python(tmp_path: Path) -> None:
-    """Old models hold dictionaries as Python prints them."""
-    path = brightness_model(tmp_path / "m.onnx", classes=2, raw_props={"names": "{0: 'sea', 1: 'road'}"})
-    assert card_of(path).channels == (1,)
-
-
 def model_of(path: Path, inputs: list[tuple], output: tuple) -> Path:
     """A model that gives values of some shape and kind, whatever it takes."""
     ports = [[helper.make_tensor_value_info(*item) for item in some] for some in (inputs, [output])]

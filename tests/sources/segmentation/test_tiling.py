@@ -59,8 +59,8 @@ def test_tiles_are_no_larger_than_they_need_be(
     tmp_path: Path, photo: Path, any_size: bool, tiles: set[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """150 rows are one tile instead of two; 180 columns are two with a quarter in common, for which 128 are enough."""
-    props = {"tiles_overlap": 25, "tile_size": 128} | ({"any_size": True} if any_size else {})
-    network = load_network(brightness_model(tmp_path / "free.onnx", size=128, props=props))
+    props = {"tiles_overlap": 25, "tiles_size": 128}
+    network = load_network(brightness_model(tmp_path / "free.onnx", size=None if any_size else 128, props=props))
     call, shown = type(network).__call__, set()
     monkeypatch.setattr(type(network), "__call__", lambda self, tile: shown.add(tile.shape[:2]) or call(self, tile))
     with open_photograph(photo) as opened:
