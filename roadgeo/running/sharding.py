@@ -13,7 +13,7 @@ import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -220,7 +220,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
         counts: dict[str, Any] = {}
         what = f"reading {file.name}"
         say(what)
-        for part in stream_lines(file, roads.layer, advance=lambda share, what=what: say(what, share)):  # type: ignore[misc]
+        for part in stream_lines(file, roads.layer, advance=partial(say, what), whole=roads.which == "all"):
             chosen = choose_lines(with_crs(part, roads.crs, file), file.name, roads.which, roads.tunnels, area)
             add_counts(counts, chosen.meta)
             crs = crs or chosen.crs

@@ -10,6 +10,7 @@ import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ def choose_roads(
         given = None if crs is None else name_crs(crs)
         return read_roads(listed, crs=given, which=which, tunnels=tunnels, attribution=attribution)
     table = held_table(roads)
-    lines = recognise(table).adapt(table)
+    lines = recognise(table).adapt(table, which == "all")
     lines = with_crs(lines, crs, name)
     lines = choose_lines(lines, name, which, tunnels)
     tell_source(name, lines.meta)
@@ -160,7 +161,8 @@ def read_roads(
     for n, file in enumerate(files, 1):
         what = f"reading {file.name}" + (f", {n} of {len(files)}" if len(files) > 1 else "")
         say(what)
-        source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
+        advance = partial(say, what)
+        source = read_lines(file, layer, advance, whole=which == "all")
         source = with_crs(source, crs, file)
         chosen = choose_lines(source, file.name, which, tunnels, area)
         tell_source(file.name, chosen.meta)

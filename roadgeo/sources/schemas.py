@@ -46,14 +46,23 @@ def _by_word(kinds: Mapping[str, Sequence[str]]) -> dict[str, str]:
 _DATA = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _WORDS = {maker: _by_word(kinds) for maker, kinds in _DATA["words"].items()}
 _CODES = {column: _by_word(kinds) for column, kinds in _DATA["codes"].items()}
-_KINDS, _TUNNELS, _NAMES, _TAGS, _OTHER_KEYS = (
-    _DATA["columns"][of] for of in ("kind", "tunnel", "name", "tags", "other")
+_SURE, _GENERAL, _TUNNELS, _NAMES, _TAGS, _OTHER_KEYS = (
+    _DATA["columns"][of] for of in ("kind", "general", "tunnel", "name", "tags", "other")
 )
+_KINDS = [*_SURE, *_GENERAL]
 _OSM_NAME, _OVERTURE = "OpenStreetMap", "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0"
 _OSM = _WORDS[_OSM_NAME] | _by_word({word: [word] for word in KNOWN_HIGHWAYS} | {_NONE: sorted(NO_ROADS)})
 _WORDS[_OSM_NAME] = _OSM
 _HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
 _OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHER_KEYS}
+#: Words that say of a line that it is a road, or none, whatever column they stand in.
+_CERTAIN = {
+    maker: {
+        word: kind for word, kind in words.items() if word not in {*map(_plain, _DATA["ambiguous"])} and "*" not in word
+    }
+    for maker, words in _WORDS.items()
+}
+_FEWEST = 2  # such words for roads, of those in a column of a general or unknown name, until all are believed
 _AREA = "area"
 _KNOWN = {name[:10] for name in (*_KINDS, *_TUNNELS, *_NAMES, *_OSM_MARKS, _AREA)}
 _PAIR = re.compile(r'"(highway|tunnel|area)"\s*(?:=>|:)\s*"([^"]*)"')
@@ -68,8 +77,8 @@ def is_known_column(name: str) -> bool:
 
 
 def names_kinds(values: AnyArray) -> bool:
-    """Whether most filled values of a column are words for kinds of lines, of one maker of maps."""
-    return _maker_of(values) is not None
+    """Whether most filled values of a column of any name are words for kinds of lines, of one maker of maps."""
+    return _words_of(values)[0] != ""
 
 
 @dataclass(frozen=True)
@@ -83,16 +92,24 @@ class Schema:
     none_is_no_road : bool
         A line without a kind is something else, as in a table of OpenStreetMap's.
     attribution : str
+    is_guess : bool
+        Of the columns none has a name that is known for kinds of roads alone.
     """
 
     kinds: tuple[tuple[str, Mapping[str, str]], ...] = ()
     none_is_no_road: bool = False
     attribution: str = ""
+    is_guess: bool = False
 
-    def adapt(self, table: RoadTable) -> RoadLines:
-        """Return the lines of a table that are roads, or may be; others are counted in `meta`."""
+    def adapt(self, table: RoadTable, whole: bool = False) -> RoadLines:
+        """Return the lines of a table that are roads, or may be; others are counted in `meta`.
+
+        Where all lines are wanted, those that a column of a general or unknown name calls something else are `whole`.
+        """
         columns = _named(table.columns)
         kinds, others = self._kinds(columns, len(table.shapes))
+        if whole and self.is_guess:
+            kinds, others = np.where(others, "", kinds), np.zeros_like(others)
         shapes = table.shapes[~others]
         lines, place = simple_lines(shapes)
         areas = simple_areas(shapes)
@@ -102,7 +119,8 @@ class Schema:
         tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
         called = next((columns[name] for name in _NAMES if name in columns), None)
         counts = {"no_roads": int(others.sum()), "broken": _count_broken(shapes)}
-        told = {"attribution": self.attribution, **table.meta, **counts}
+        by = " and ".join(name for name, _ in self.kinds)
+        told = {"attribution": self.attribution, "kind_columns": by if self.is_guess else "", **table.meta, **counts}
         return RoadLines(
             lines,
             crs_name(table.crs),
@@ -136,13 +154,15 @@ def recognise(table: RoadTable) -> Schema:
     makers: dict[str, str] = {}
     kinds: dict[str, Mapping[str, str]] = {}
     others = [name for name in columns if name not in _KNOWN]
+    is_overture = {"subtype", "class"} <= columns.keys()
     for name in [name for name in _KINDS if name in columns] + others:
         if name in others and kinds:
             break
+        maker, words = _words_of(columns[name], name in _SURE or (is_overture and name in _GENERAL))
         if _share(columns[name], _CODES.get(name, {})) > 0.5:
             kinds[name] = _CODES[name]
-        elif maker := _maker_of(columns[name]):
-            kinds[name], makers[name] = _WORDS[maker], maker
+        elif maker:
+            kinds[name], makers[name] = words, maker
             if name in ("highway", "fclass") and maker == _OSM_NAME:
                 break
     is_osm = bool(columns.keys() & _OSM_MARKS) or table.meta.get("format") == _OSM_NAME
@@ -157,7 +177,8 @@ def recognise(table: RoadTable) -> Schema:
     # A table with `highway` and nothing else of OpenStreetMap's was made of roads alone: there a kind is missing.
     is_whole = any(name in _KNOWN for name in columns if name != "highway")
     is_own = is_whole and any(kinds.get(name) is words for name, words in (("highway", _HIGHWAY), ("fclass", _OSM)))
-    return Schema(tuple(kinds.items()), is_own, next(filter(None, credit), ""))
+    is_guess = not is_overture and not any(name in _SURE for name in kinds)
+    return Schema(tuple(kinds.items()), is_own, next(filter(None, credit), ""), is_guess)
 
 
 def _named(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
@@ -171,19 +192,34 @@ def _named(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     return named
 
 
-def _maker_of(values: AnyArray) -> str | None:
-    """Return the maker of maps whose words most filled values are."""
+def _words_of(values: AnyArray, sure: bool = False) -> tuple[str, Mapping[str, str]]:
+    """Return the maker of maps whose words most filled values are, and those of its words that are believed.
+
+    In a column of a name that is not `sure`, all are where several of them can be nothing but roads; otherwise those
+    that can be nothing else, if most are. "" without a maker.
+    """
     shares = {maker: _share(values, words) for maker, words in _WORDS.items()}
     best = max(shares, key=lambda maker: shares[maker])
-    return best if shares[best] > 0.5 else None
+    if shares[best] <= 0.5:
+        return "", {}
+    said = {_plain(word) for value in _sample(values) for word in _split(value)}
+    n_roads = len({word for word in said if _CERTAIN[best].get(word, _NONE) != _NONE})
+    if sure or n_roads >= _FEWEST:
+        return best, _WORDS[best]
+    return (best, _CERTAIN[best]) if _share(values, _CERTAIN[best]) > 0.5 else ("", {})
+
+
+def _sample(values: AnyArray) -> list[Any]:
+    """Return filled values from all over a column."""
+    filled = [value for value in values if _is_filled(value)]
+    return filled[:: max(len(filled) // _SAMPLE, 1)]
 
 
 def _share(values: AnyArray, words: Mapping[str, str]) -> float:
     """Return the share of the filled values that is known."""
     if not words:
         return 0.0
-    filled = [value for value in values if _is_filled(value)]
-    sample = filled[:: max(len(filled) // _SAMPLE, 1)]
+    sample = _sample(values)
     known = sum(any(_look_up(word, words) for word in _split(value)) for value in sample)
     return known / len(sample) if sample else 0.0
 

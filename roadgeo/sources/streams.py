@@ -106,7 +106,12 @@ def _tells_kinds(file: Path) -> bool:
 
 
 def read_lines(
-    path: Path, layer: str | None = None, advance: Callable[[float], None] = lambda _: None, *, areas: bool = False
+    path: Path,
+    layer: str | None = None,
+    advance: Callable[[float], None] = lambda _: None,
+    *,
+    areas: bool = False,
+    whole: bool = False,
 ) -> RoadLines:
     """Read the lines of a road file that are roads, or may be.
 
@@ -119,13 +124,15 @@ def read_lines(
         Called with the share of the file that is read.
     areas : bool
         Roads drawn as polygons will do where there are no lines.
+    whole : bool
+        Lines that a column of a general or unknown name calls something else than roads are wanted, too.
 
     Raises
     ------
     RoadSourceError
         The file is missing, unreadable, empty or holds no lines.
     """
-    parts = list(stream_lines(path, layer, _WHOLE, advance, areas=areas))
+    parts = list(stream_lines(path, layer, _WHOLE, advance, areas=areas, whole=whole))
     if len({part.crs for part in parts}) > 1:
         raise RoadSourceError(f"{path}: its files are in different CRS; unpack it, and name them one by one")
     return join_lines(parts)
@@ -138,6 +145,7 @@ def stream_lines(
     advance: Callable[[float], None] = lambda _: None,
     *,
     areas: bool = False,
+    whole: bool = False,
 ) -> Iterator[RoadLines]:
     """Yield the lines of a road file as `read_lines` gives them, in parts of bounded size.
 
@@ -152,7 +160,7 @@ def stream_lines(
             schema = None
             for table in stream_tables(file, layer, most, advance, Path(folder), areas=areas):
                 schema = schema or recognise(table)
-                part = schema.adapt(table)
+                part = schema.adapt(table, whole)
                 n += len(part.lines) + (len(part.areas) if areas else 0)
                 counts = {key: value + part.meta.get(key, 0) for key, value in counts.items()}
                 yield part
@@ -179,17 +187,17 @@ def _unpacked(path: Path, folder: Path) -> list[Path]:
 
 def tell_source(name: str, meta: Mapping[str, Any]) -> None:
     """Report the parts of a source that were left out, or are not known."""
-    counts = {
+    reasons = {
         "no_roads": "are no roads: streams, railways, fences, or not built",
         "broken": "have a vertex that is not finite",
         "without_places": "are ways whose nodes are not in the file",
         "astray": "lie beyond the Earth, or have a vertex at 0, 0 far off all others",
     }
-    for key, what in counts.items():
+    for key, what in reasons.items():
         if meta.get(key):
-            _LOG.warning(
-                "%s: left out %s of %s features, which %s", name, f"{meta[key]:,}", f"{meta['features']:,}", what
-            )
+            by = f", by its column {meta['kind_columns']}; --kinds all keeps them" if meta.get("kind_columns") else ""
+            counts = f"{meta[key]:,}", f"{meta['features']:,}"
+            _LOG.warning("%s: left out %s of %s features, which %s", name, *counts, what + by * (key == "no_roads"))
     if "exchanged" in meta:
         _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", name, EXCHANGED)
     if "part" in meta:

@@ -1,7 +1,10 @@
 """Tables of all schemas, in all containers, give the same roads."""
 
+import gzip
 import logging
 
+import geopandas as gpd
+import networkx as nx
 import numpy as np
 import pytest
 import shapely
@@ -32,8 +35,6 @@ def roads_of(schema, container, folder, **options):
         frame(schema).to_parquet(folder / "roads.parquet")
         return read_roads(folder / "roads.parquet", **options)
     if container == "geojson.gz":
-        import gzip
-
         write_vector(folder / "roads.geojson", shapes, **columns)
         (folder / "roads.geojson.gz").write_bytes(gzip.compress((folder / "roads.geojson").read_bytes()))
         return read_roads(folder / "roads.geojson.gz", **options)
@@ -97,7 +98,8 @@ def test_whom_to_name(columns, attribution):
 @pytest.mark.parametrize(
     ("columns", "kinds"),
     [
-        ({"road_kind": ["residential", "footway", None]}, ["residential", "footway", ""]),  # a column of any name
+        ({"road_kind": ["tertiary", "footway", None]}, ["tertiary", "footway", ""]),  # a column of any name
+        ({"type": ["footway", "footway", "path"]}, ["footway", "footway", ""]),
         ({"surface": ["asphalt", "gravel", "residential"]}, None),
         ({"type": ["A", "B", "residential"]}, None),
         ({"highway": ["something_new", "residential", "residential"]}, ["something_new", "residential", "residential"]),
@@ -126,6 +128,54 @@ def test_what_tells_the_kind(columns, kinds):
     read = recognise(made).adapt(made)
     assert (read.highway.tolist() if read.kinds_known else None) == kinds
     assert len(read.lines) == (len(kinds) if kinds is not None else 2 if "railway" in columns else 3)
+
+
+#: Words for something else that are words for kinds, too.
+OTHER_WORDS = {
+    "Entity": ["Line", "LWPolyline", "Line"],
+    "zone": ["residential", "forest", "park"],
+    "landuse_1": ["residential", "service", "park"],
+    "type": ["path", "path", "path"],
+    "class": ["line", "line", "line"],
+    "subtype": ["track", "track", "path"],
+    "ref": ["B27", "D905", "E40"],
+    "nature": ["Chemin", "Mur", "Chemin"],
+    "state": ["construction", "planned", "abandoned"],
+    "geom_type": ["line", "Line", "unknown"],
+}
+
+
+@pytest.mark.parametrize("container", ["gpkg", "shp", "geojson", "fgb", "parquet", "frame", "geojson.gz", "graph"])
+@pytest.mark.parametrize("name", OTHER_WORDS)
+def test_words_of_other_columns_are_no_kinds(tmp_path, name, container, caplog):
+    shapes = [shapely.LineString([(k, 0), (k, 1)]) for k in (0.0, 0.01, 0.02)]
+    columns = {name: OTHER_WORDS[name]}
+    if container == "graph":
+        graph = nx.MultiGraph(crs="EPSG:4326")
+        for shape, word in zip(shapes, columns[name], strict=True):
+            graph.add_edge(shape.coords[0], shape.coords[-1], geometry=shape, **{name: word})
+        roads = choose_roads(graph)
+    elif container in ("parquet", "frame"):
+        table = gpd.GeoDataFrame(columns, geometry=shapes, crs=4326)
+        table.to_parquet(tmp_path / "roads.parquet")
+        roads = choose_roads(table if container == "frame" else tmp_path / "roads.parquet")
+    else:
+        path = write_vector(tmp_path / f"roads.{container.removesuffix('.gz')}", shapes, **columns)
+        if container.endswith("gz"):
+            path = tmp_path / "roads.geojson.gz"
+            path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
+        roads = choose_roads(path)
+    assert len(roads) == 3
+    assert "left out" not in caplog.text
+
+
+def test_a_column_that_is_believed_is_named_and_all_keeps_all(tmp_path, caplog):
+    shapes = [shapely.LineString([(k, 0), (k, 1)]) for k in (0.0, 0.01, 0.02)]
+    path = write_vector(tmp_path / "a.gpkg", shapes, art=["tertiary", "motorway", "river"])
+    assert len(choose_roads(path)) == 2
+    assert "left out 1 of 3 features, which are no roads" in caplog.text
+    assert "by its column art; --kinds all keeps them" in caplog.text
+    assert len(choose_roads(path, "all")) == 3
 
 
 @pytest.mark.parametrize(
