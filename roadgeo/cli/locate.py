@@ -152,7 +152,7 @@ _OPTIONS = (
     row("--units", ("auto", "pixels", "metres"), IMAGE,
         "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
         default="auto", show_default=True, rare=True),
-    row("--layer", "NAME", IMAGE, "Layer of roads that come as lines.", rare=True),
+    row("--layer", "NAME", IMAGE, "Layer of roads that come as lines. Repeatable.", multiple=True, rare=True),
     row("--page", "N", IMAGE,
         "Page of a TIFF that holds several. Default: the first.", type=click.IntRange(1), rare=True),
     take("jobs"),

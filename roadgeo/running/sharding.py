@@ -72,7 +72,7 @@ class RoadFiles:
     """Road files, and which of their roads are taken (see `sources.roads.read_roads`)."""
 
     paths: tuple[Path, ...]
-    layer: str | None = None
+    layer: str | Sequence[str] | None = None
     crs: str | None = None
     which: RoadKind = "drivable"
     tunnels: bool = False

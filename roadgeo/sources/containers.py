@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,9 +34,11 @@ _GDAL = (
 #: Names of road files.
 ENDINGS = OSM_ENDINGS + _PARQUET + _GRAPHS + _GDAL
 
-#: Layers to prefer where a file has several with lines, and drivers whose layers are parts of one drawing.
-_LAYERS = ("roads", "edges", "lines", "entities")
-_DRAWINGS = (".gpx", ".kml", ".kmz")
+#: Layers to prefer where a file has several with lines, and files whose layers are parts of one drawing.
+_LAYERS = ("roads", "edges", "lines", "entities", "elements")
+_ONE_DRAWING = (".gpx", ".kml", ".kmz")
+#: Drawings, whose layers GDAL gives as a column of one layer; and its names, in tables made of drawings too.
+_DRAWINGS, _LEVELS = (".dxf", ".dgn", ".dwg"), ("layer", "level", "layername", "layer_name")
 #: Names of columns that hold shapes in a Parquet file without `geo`.
 _SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
 _PEEK = 1000
@@ -53,14 +55,20 @@ _EXPECTED = (
 
 
 def stream_tables(
-    path: Path, layer: str | None, most: int, advance: Callable[[float], None], folder: Path, *, areas: bool = False
+    path: Path,
+    layer: str | Sequence[str] | None,
+    most: int,
+    advance: Callable[[float], None],
+    folder: Path,
+    *,
+    areas: bool = False,
 ) -> Iterator[RoadTable]:
     """Yield the content of a file in parts, of a bounded number of features each.
 
     Parameters
     ----------
-    layer : str, optional
-        Layer of a file with several; the one with lines by default, all of a GPX or KML file.
+    layer : str or sequence of str, optional
+        Layers of a file, or of the drawing that it was made of; by default the one with lines, of GPX and KML all.
     advance : callable
         Called with the share of the file that is read.
     folder : Path
@@ -89,34 +97,45 @@ def stream_tables(
 # --- GDAL -------------------------------------------------------------------------------------------------------------
 
 
+class _Part(NamedTuple):
+    """A layer of a file, or the rows in it that are in layers of a drawing, which a column names."""
+
+    layer: str
+    column: str = ""
+    levels: tuple[str, ...] = ()
+
+
 def _stream_gdal(
-    path: Path, layer: str | None, most: int, advance: Callable[[float], None], *, areas: bool
+    path: Path, layer: str | Sequence[str] | None, most: int, advance: Callable[[float], None], *, areas: bool
 ) -> Iterator[RoadTable]:
     import shapely
 
-    layers = _choose_layers(path, layer, areas=areas)
-    for n, held in enumerate(layers):
-        total, columns = _choose_columns(path, held)
+    parts = _choose_parts(path, [layer] if isinstance(layer, str) else [*(layer or ())], areas=areas)
+    for n, (held, column, levels) in enumerate(parts):
+        total, columns, hint = _choose_columns(path, held)
         part = what_is_missing(path, total)
         for skip in range(0, max(total, 1), most):
-            found = read_layer(path, held, columns, skip, most if total > most else None)
+            more = [column] * (column not in ("", *columns))
+            found = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
             if found.shapes is None:
                 raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
-            shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
-            meta = {"format": found.driver, "layer": ", ".join(layers), **found.notes}
-            meta |= {"part": part} if part else {}
-            yield RoadTable(shapes, found.crs, found.columns, meta)
-            advance((n + min((skip + most) / max(total, 1), 1.0)) / len(layers))
+            shapes, table = shapely.from_wkb(found.shapes, on_invalid="ignore"), dict(found.columns)
+            if column:
+                named = table[column.lower()] if column in columns else table.pop(column.lower())
+                rows = np.isin(named.astype(str), levels)
+                shapes, table = shapes[rows], {name: values[rows] for name, values in table.items()}
+            meta = {"format": found.driver, "layer": ", ".join(levels or [one.layer for one in parts]), **found.notes}
+            meta |= ({"part": part} if part else {}) | ({"levels": hint} if hint and not levels else {})
+            yield RoadTable(shapes, found.crs, table, meta)
+            advance((n + min((skip + most) / max(total, 1), 1.0)) / len(parts))
 
 
-def _choose_layers(path: Path, layer: str | None, *, areas: bool) -> list[str]:
-    """Return the layers to read: the one asked for, or those with lines (or with polygons, where they will do)."""
+def _choose_parts(path: Path, asked: Sequence[str], *, areas: bool) -> list[_Part]:
+    """Return what to read: the layers asked for, or those with lines (or with polygons, where they will do)."""
     layers = list_layers(path)
     names = [name for name, _ in layers]
-    if layer is not None:
-        if layer not in names:
-            raise RoadSourceError(f"{path}: no layer {layer!r}; it has {_listed(names)}: choose with --layer")
-        return [layer]
+    if asked and {*asked} <= {*names}:
+        return [_Part(name) for name in asked]
     drawn = [name for name, kind in layers if kind in {"None", "Unknown"} or "Line" in kind or "Collection" in kind]
     if not drawn and areas:
         drawn = [name for name, kind in layers if "Polygon" in kind]
@@ -126,11 +145,32 @@ def _choose_layers(path: Path, layer: str | None, *, areas: bool) -> list[str]:
     if len(drawn) > 1:
         drawn = [name for name in drawn if _is_filled(path, name)] or drawn[:1]
     preferred = [name for name in _LAYERS if name in drawn]
-    if len(drawn) == 1 or path.name.lower().endswith(_DRAWINGS):
-        return drawn
-    if not preferred:
-        raise RoadSourceError(f"{path}: several layers hold lines, {_listed(drawn)}: choose one with --layer")
-    return preferred[:1]
+    chosen = drawn if len(drawn) == 1 or path.name.lower().endswith(_ONE_DRAWING) else preferred[:1]
+    is_drawing = path.name.lower().endswith(_DRAWINGS)
+    column, levels = _levels(path, chosen[0], areas) if (asked or is_drawing) and len(chosen) == 1 else ("", [])
+    if asked and {*asked} <= {*levels}:
+        return [_Part(chosen[0], column, tuple(asked))]
+    if asked:
+        wrong = next(name for name in asked if name not in {*names, *levels})
+        raise RoadSourceError(f"{path}: no layer {wrong!r}; it has {_listed(names + levels)}: choose with --layer")
+    if not chosen or len(levels) > 1:
+        raise RoadSourceError(
+            f"{path}: several layers hold lines, {_listed(levels or drawn)}: choose with --layer, which is repeatable"
+        )
+    return [_Part(name) for name in chosen]
+
+
+def _levels(path: Path, layer: str, areas: bool) -> tuple[str, list[str]]:
+    """Return the column that names layers of a drawing, and those that hold lines (or polygons); "" without one."""
+    import shapely
+
+    column = next((name for name in describe_layer(path, layer)[1] if name.lower() in _LEVELS), "")
+    found = read_layer(path, layer, [column]) if column else None
+    if found is None or found.shapes is None:
+        return "", []
+    kinds = shapely.get_type_id(shapely.from_wkb(found.shapes, on_invalid="ignore"))
+    lines = np.isin(kinds, (1, 2, 5, 7, *((3, 6) if areas else ())))
+    return column, sorted({str(value) for value in found.columns[column.lower()][lines] if value is not None})
 
 
 def _is_filled(path: Path, layer: str) -> bool:
@@ -140,14 +180,20 @@ def _is_filled(path: Path, layer: str) -> bool:
         return True
 
 
-def _choose_columns(path: Path, layer: str) -> tuple[int, list[str]]:
-    """Return the size of a layer, and its columns that may describe a road: by their names, else by their values."""
+def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
+    """Return the size of a layer, and its columns that may describe a road: by their names, else by their values.
+
+    The third is which layers of a drawing its rows come from, for people; "" where it does not say, or from one.
+    """
     total, fields = describe_layer(path, layer)
     known = [name for name in fields if is_known_column(name)]
     if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
-        return total, known
+        return total, known, ""
     head = read_layer(path, layer, fields, 0, _PEEK).columns
-    return total, known + [name for name in fields if name not in known and names_kinds(head[name.lower()])]
+    column = next((name for name in fields if name.lower() in _LEVELS), "")
+    levels = sorted({value for value in head.get(column.lower(), ()) if isinstance(value, str) and not value.isdigit()})
+    hint = f"{column}: {_listed(levels)}" if len(levels) > 1 else ""
+    return total, known + [name for name in fields if name not in known and names_kinds(head[name.lower()])], hint
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,13 +54,15 @@ class Drawing:
     north_up: bool
 
 
-def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str | None = None) -> Drawing:
+def draw_roads(
+    path: str | os.PathLike[str], units: Units = "auto", layer: str | Sequence[str] | None = None
+) -> Drawing:
     """Read the roads of a file as `read_roads` does and draw them: lines, or without lines polygons.
 
     Parameters
     ----------
-    layer : str, optional
-        Layer of a file with several.
+    layer : str or sequence of str, optional
+        Layers of a file with several.
     units : "auto", "pixels" or "metres"
         Units of their coordinates. By default degrees or metres where the file names a CRS that they fit, and pixels of
         a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.

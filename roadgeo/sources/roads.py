@@ -116,7 +116,7 @@ def choose_roads(
 
 def read_roads(
     path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
-    layer: str | None = None,
+    layer: str | Sequence[str] | None = None,
     crs: str | None = None,
     which: RoadKind = "drivable",
     *,
@@ -131,8 +131,8 @@ def read_roads(
     ----------
     path : path or sequence of paths
         A folder stands for every road file in it.
-    layer : str, optional
-        Layer of files that have several.
+    layer : str or sequence of str, optional
+        Layers of files that have several, or of the drawings that they were made of.
     crs : str, optional
         CRS of the coordinates, whatever the files state. Needed where a file states none, as a shapefile without its
         .prj. OpenStreetMap files are always in degrees.

@@ -6,15 +6,18 @@ import logging
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from roadgeo._text import visible
 from roadgeo.errors import NoRoadsError, RoadgeoError, RoadSourceError
+from roadgeo.geometry.projection import transform
 from roadgeo.sources.containers import ENDINGS, stream_tables
 from roadgeo.sources.lines import RoadLines, join_lines
 from roadgeo.sources.osm_files import OSM_ENDINGS
-from roadgeo.sources.schemas import recognise
+from roadgeo.sources.schemas import Schema, recognise
 from roadgeo.storage.geopackage import layer_names
 from roadgeo.storage.unpacking import PACKED, unpack
 from roadgeo.storage.vectors import first_line, require_file
@@ -107,7 +110,7 @@ def _tells_kinds(file: Path) -> bool:
 
 def read_lines(
     path: Path,
-    layer: str | None = None,
+    layer: str | Sequence[str] | None = None,
     advance: Callable[[float], None] = lambda _: None,
     *,
     areas: bool = False,
@@ -118,8 +121,8 @@ def read_lines(
     Parameters
     ----------
     path : Path
-    layer : str, optional
-        Layer of a file with several; the one with lines by default.
+    layer : str or sequence of str, optional
+        Layers of a file, or of the drawing that it was made of; the one with lines by default.
     advance : callable, optional
         Called with the share of the file that is read.
     areas : bool
@@ -133,14 +136,24 @@ def read_lines(
         The file is missing, unreadable, empty or holds no lines.
     """
     parts = list(stream_lines(path, layer, _WHOLE, advance, areas=areas, whole=whole))
-    if len({part.crs for part in parts}) > 1:
-        raise RoadSourceError(f"{path}: its files are in different CRS; unpack it, and name them one by one")
-    return join_lines(parts)
+    if any(part.crs is None for part in parts) and len({part.crs for part in parts}) > 1:
+        raise RoadSourceError(f"{path}: only some of its files or layers name a CRS; read them one by one")
+    return join_lines([_in_crs(part, parts[0].crs) for part in parts])
+
+
+def _in_crs(part: RoadLines, crs: str | None) -> RoadLines:
+    """Return lines in a CRS."""
+    import shapely
+
+    if crs is None or part.crs is None or part.crs == crs:
+        return part
+    move = partial(transform, part.crs, crs)
+    return replace(part, crs=crs, lines=shapely.transform(part.lines, move), areas=shapely.transform(part.areas, move))
 
 
 def stream_lines(
     path: Path,
-    layer: str | None = None,
+    layer: str | Sequence[str] | None = None,
     most: int = 100_000,
     advance: Callable[[float], None] = lambda _: None,
     *,
@@ -157,9 +170,10 @@ def stream_lines(
     n, counts = 0, {"no_roads": 0, "without_places": 0}
     with reading(path), tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
         for file in _unpacked(path, Path(folder)):
-            schema = None
+            schemas: dict[frozenset[str], Schema] = {}
             for table in stream_tables(file, layer, most, advance, Path(folder), areas=areas):
-                schema = schema or recognise(table)
+                names = frozenset(table.columns)
+                schema = schemas[names] = schemas.get(names) or recognise(table)
                 part = schema.adapt(table, whole)
                 n += len(part.lines) + (len(part.areas) if areas else 0)
                 counts = {key: value + part.meta.get(key, 0) for key, value in counts.items()}
@@ -210,9 +224,10 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
     if not meta["kinds_known"]:
         _LOG.warning(
             "%s: no column tells what kind of road a line is (as highway, fclass or class do): all %s lines are taken, "
-            "paths too, and --kinds does nothing",
+            "paths too, and --kinds does nothing%s",
             name,
             f"{meta['kept']:,}",
+            f"; --layer chooses by {visible(meta['levels'])}" if "levels" in meta else "",
         )
 
 

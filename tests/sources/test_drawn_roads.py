@@ -19,7 +19,7 @@ def test_a_layer_is_chosen(tmp_path, mask):
     file = tmp_path / "map.gpkg"
     write_vector(file, [shapely.LineString([(0, 0), (1, 1)])], layer="rivers")
     write_vector(file, streets()[0], layer="streets", append=True)
-    with pytest.raises(MaskError, match="several layers hold lines, rivers, streets: choose one with --layer"):
+    with pytest.raises(MaskError, match="several layers hold lines, rivers, streets: choose with --layer"):
         draw_roads(file)
     assert (draw_roads(file, layer="streets").mask.roads == mask).all()
 

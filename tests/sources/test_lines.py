@@ -143,7 +143,7 @@ def test_layers(tmp_path):
     write_vector(file, line, layer="streets", append=True)
     assert read_lines(file).meta["layer"] == "streets"
     write_vector(file, line * 2, layer="rivers", append=True)
-    with pytest.raises(RoadSourceError, match="several layers hold lines, streets, rivers: choose one with --layer"):
+    with pytest.raises(RoadSourceError, match="several layers hold lines, streets, rivers: choose with --layer"):
         read_lines(file)
     assert len(read_lines(file, "rivers").lines) == 2
     with pytest.raises(RoadSourceError, match="no layer 'roads'; it has places, streets, rivers"):

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import shapely
-from worlds.fenway import streets, write_streets
+from worlds.fenway import streets, write_streets, write_vector
 
 from roadgeo.errors import RoadSourceError
+from roadgeo.geometry.projection import transformer
 from roadgeo.sources import osm_files
+from roadgeo.sources.roads import read_roads
 from roadgeo.sources.streams import read_lines, stream_lines
 
 FORMATS = ["streets.gpkg", "streets.shp", "streets.geojson", "streets.parquet", "streets.osm.gz", "streets.osm.pbf"]
@@ -42,3 +44,46 @@ def test_what_cannot_be_read_says_so(tmp_path, name):
     path.write_bytes(b"PAR1 nothing of the kind")
     with pytest.raises(RoadSourceError, match=name):
         list(stream_lines(path))
+
+
+def drawing(path, *layers):
+    """Write a drawing of lines in layers, as DXF."""
+    lines = [shapely.LineString([(k, 0), (k, 100)]) for k in range(len(layers))]
+    return write_vector(path, lines, "EPSG:32629", Layer=list(layers))
+
+
+@pytest.mark.parametrize(("asked", "n"), [("ROAD-CL", 2), (["ROAD-CL"], 2), (["ROAD-CL", "LANE"], 3), (("LANE",), 1)])
+@pytest.mark.parametrize("name", ["plan.dxf", "plan.shp", "plan.gpkg", "plan.geojson", "plan.tab", "plan.fgb"])
+def test_layers_of_a_drawing_are_chosen(tmp_path, name, asked, n):
+    path = drawing(tmp_path / name, "ROAD-CL", "CONTOUR", "ROAD-CL", "LANE", "PARCEL")
+    assert len(read_lines(path, asked).lines) == n
+    assert len(list(stream_lines(path, asked, most=2))) >= 1
+    assert sum(len(part.lines) for part in stream_lines(path, asked, most=2)) == n
+    with pytest.raises(RoadSourceError, match=r"no layer 'road'; it has .*CONTOUR, LANE, PARCEL, ROAD-CL: choose"):
+        read_lines(path, "road")
+
+
+def test_layers_of_a_drawing_are_listed(tmp_path, caplog):
+    with pytest.raises(RoadSourceError, match="several layers hold lines, CONTOUR, ROAD-CL: choose with --layer"):
+        read_lines(drawing(tmp_path / "a.dxf", "ROAD-CL", "CONTOUR"))
+    assert len(read_lines(drawing(tmp_path / "b.dxf", "ROAD-CL", "ROAD-CL")).lines) == 2
+    read_roads(drawing(tmp_path / "a.shp", "ROAD-CL", "CONTOUR"), crs="EPSG:32629")
+    assert "--layer chooses by Layer: CONTOUR, ROAD-CL" in caplog.text
+    caplog.clear()
+    read_roads(drawing(tmp_path / "osm.shp", "0", "1"), crs="EPSG:32629")  # above one another
+    assert "--layer" not in caplog.text
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:32619"])
+def test_several_layers_are_read_together(tmp_path, crs):
+    """A layer for each class, of another CRS and of other columns each."""
+    lines, highway, _ = streets()
+    path, there = tmp_path / "a.gpkg", transformer("EPSG:4326", crs).transform
+    write_vector(path, lines[:3], layer="main", highway=highway[:3])
+    moved = [shapely.transform(line, lambda xy: np.c_[there(*xy.T)]) for line in lines[3:]]
+    write_vector(path, moved, crs=crs, layer="local", append=True, kind=["yes"] * len(moved))
+    found = read_lines(path, ["main", "local"])
+    assert len(found.lines) == len(lines)
+    assert shapely.hausdorff_distance(found.lines, np.array(lines)).max() < 1e-7
+    assert found.highway.tolist() == highway[:3] + [""] * len(moved)
+    assert len(read_lines(path, "local").lines) == len(moved)
