@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -10,11 +11,12 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
+from roadgeo._text import visible
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.reference import AnyReference, swapped_near
 from roadgeo.running.choosing import choose_place
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
@@ -25,10 +27,12 @@ from roadgeo.sources.drawn_roads import draw_roads
 from roadgeo.sources.georeference import read_pixel_shape
 from roadgeo.sources.masks import MaskSource, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
-from roadgeo.sources.streams import QUERY_ENDINGS
+from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS
 from roadgeo.workflows import locate
 
 __all__ = ["FirstLook", "locate_query", "look_once"]
+
+_LOG = logging.getLogger(__name__)
 
 #: Name in results of a picture that is no file.
 _ARRAY = "array"
@@ -198,6 +202,8 @@ def _locate_lines(
 ) -> Sighting:
     """Locate roads given as lines; their units restrict scale and north unless the user gives narrower limits."""
     drawing, camera = draw_roads(path, reading.units, reading.layer), options.match.camera
+    if drawing.middle is not None and swapped_near((*drawing.middle, 1000.0), references) is not None:
+        _LOG.warning("%s: its coordinates lie on none of the maps; %s", visible(path), EXCHANGED)
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
         known = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
         tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map

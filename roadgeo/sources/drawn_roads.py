@@ -20,7 +20,7 @@ from roadgeo._text import visible
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.homography import shift
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.geometry.projection import choose_plane, from_lonlat
+from roadgeo.geometry.projection import choose_plane, serves_as_plane, to_lonlat, to_plane
 from roadgeo.storage.crs import known_crs
 
 __all__ = ["Drawing", "Units", "draw_roads"]
@@ -41,17 +41,21 @@ class Drawing:
     Attributes
     ----------
     to_pixel : (3, 3) float64 or None
-        The lines' coordinates to pixels of the mask (column, row; corner convention). None where they came in degrees.
+        The lines' coordinates to pixels of the mask (column, row; corner convention). None where they came in degrees,
+        or in another CRS that is not true to scale: they are drawn in metres.
     unit_m : float or None
         Metres per pixel, where the lines' units determine it.
     north_up : bool
         Whether the units imply that up is north, within a few degrees.
+    middle : (lon, lat) or None
+        Where they lie by their own CRS.
     """
 
     mask: RoadMask
     to_pixel: FloatArray | None
     unit_m: float | None
     north_up: bool
+    middle: tuple[float, float] | None = None
 
 
 def draw_roads(
@@ -64,21 +68,24 @@ def draw_roads(
     layer : str or sequence of str, optional
         Layers of a file with several.
     units : "auto", "pixels" or "metres"
-        Units of their coordinates. By default degrees or metres where the file names a CRS that they fit, and pixels of
-        a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
+        Units of their coordinates. By default those of the CRS that the file names, if they fit it, and pixels of a
+        picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
 
     Raises
     ------
     MaskError
         The file holds no lines, or its units are unknown.
     """
-    from roadgeo.sources.streams import read_lines
+    from roadgeo.sources.roads import are_exchanged
+    from roadgeo.sources.streams import EXCHANGED, read_lines
 
     name = os.fspath(path)
     try:
         read = read_lines(Path(path), layer, areas=True)
     except RoadSourceError as error:
         raise MaskError(str(error)) from error
+    if are_exchanged(read):
+        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", visible(name), EXCHANGED)
     if "part" in read.meta:
         _LOG.warning("%s: %s", visible(name), read.meta["part"])
     import shapely
@@ -88,10 +95,13 @@ def draw_roads(
     shapes = read.lines if is_drawn else read.areas
     coords = shapely.get_coordinates(shapes)
     kind = _tell_units(name, coords, read.crs) if units == "auto" else units
-    degrees = kind == "degrees"
-    if degrees:
-        plane = choose_plane(coords)
-        shapes = shapely.transform(shapes, partial(from_lonlat, plane))
+    lonlat = to_lonlat(read.crs, coords) if read.crs is not None and kind != "pixels" and units == "auto" else None
+    lonlat = None if lonlat is None or not np.isfinite(lonlat).all() else lonlat
+    middle = None if lonlat is None else (float(lonlat[:, 0].mean()), float(lonlat[:, 1].mean()))
+    moved = lonlat is not None and not serves_as_plane(str(read.crs), lonlat)
+    if lonlat is not None and moved:
+        plane = choose_plane(lonlat)
+        shapes = shapely.transform(shapes, partial(to_plane, str(read.crs), plane))
         coords = shapely.get_coordinates(shapes)
     # The lines' plane with y up: rows of a picture count downwards.
     downwards = kind == "pixels" and coords[:, 1].max() > 0
@@ -109,7 +119,7 @@ def draw_roads(
     shapes = shapely.buffer(shapes, road / 2.0, quad_segs=2) if is_drawn else shapes
     roads = rasterize(shapes, (int(height), int(width)), dtype=np.uint8).view(np.bool_)
     mask = RoadMask(roads, name=name)
-    return Drawing(mask, None if degrees else to_pixel, None if kind == "pixels" else unit, degrees)
+    return Drawing(mask, None if moved else to_pixel, None if kind == "pixels" else unit, moved, middle)
 
 
 def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixels", "metres", "degrees"]:

@@ -30,7 +30,17 @@ from roadgeo.sources.streams import EXCHANGED, list_sources, read_lines, tell_so
 from roadgeo.storage.crs import known_crs, name_crs
 
 __all__ = [
-    *("Box", "Roads", "choose_lines", "choose_roads", "fetch_roads", "join_roads", "read_roads", "with_crs"),
+    *(
+        "Box",
+        "Roads",
+        "are_exchanged",
+        "choose_lines",
+        "choose_roads",
+        "fetch_roads",
+        "join_roads",
+        "read_roads",
+        "with_crs",
+    ),
 ]
 
 _LOG = logging.getLogger(__name__)
@@ -272,7 +282,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
         "kinds_known": source.kinds_known or which == "all",
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
-        **({"exchanged": True} if _are_exchanged(chosen) else {}),
+        **({"exchanged": True} if are_exchanged(chosen) else {}),
         **({"astray": int(astray.sum())} if astray.any() else {}),
         **({"without_kind": kindless} if kindless else {}),
         "kept": len(chosen.lines),
@@ -323,7 +333,7 @@ def _astray(source: RoadLines, name: str) -> BoolArray:
     sound = np.asarray((np.isfinite(lonlat) & (np.abs(lonlat) <= (360.0, 90.0) * 2)).all(axis=1))
     if np.count_nonzero(~sound) > _MOST_ASTRAY * len(sound):
         reach = np.abs(shapely.total_bounds(source.lines)).max()
-        hint = EXCHANGED if _are_exchanged(source) else "give the right one with --crs"
+        hint = EXCHANGED if are_exchanged(source) else "give the right one with --crs"
         raise CrsError(f"{name}: coordinates reach {reach:.6g} and do not fit its CRS, {str(source.crs)[:40]}; {hint}")
     coords, line = shapely.get_coordinates(source.lines, return_index=True)
     suspected = np.isin(np.arange(len(sound)), line[(coords == 0.0).all(axis=1)])
@@ -334,11 +344,11 @@ def _astray(source: RoadLines, name: str) -> BoolArray:
     return ~sound
 
 
-def _are_exchanged(source: RoadLines) -> bool:
+def are_exchanged(source: RoadLines) -> bool:
     """Whether lines lie outside the area that their CRS is made for, and within it with coordinates exchanged."""
     import shapely
 
-    area = known_crs(str(source.crs)).area_of_use
+    area = None if source.crs is None else known_crs(source.crs).area_of_use
     if area is None or not len(source.lines) or area.west > area.east:
         return False
     bounds = shapely.bounds(source.lines)
