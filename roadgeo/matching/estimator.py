@@ -21,9 +21,9 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.road_search import RoadSearch
+from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
 from roadgeo.matching.scene import AGREE_DEG, Scene
-from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, larger
+from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, cut_to_units, larger, n_units
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
@@ -118,6 +118,18 @@ class TripleEstimator:
         self._n_rounds, self._anchors = 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
+        self.in_company = False  # whether it is searched with others first, by the first sweep, and then alone
+
+    def leave_company(self) -> None:
+        """Go on as if no other part were searched; the places that were verified stay known."""
+        self.in_company, self.proposed, self.ledger = False, None, Ledger(len(self.index))
+        self.sweeps = SharedSweeps(self.scene, self.options.camera, self.sweeps.ahead, alone=True)
+        self.sweeps.members.append(self)
+
+    @cached_property
+    def units(self) -> IntArray:
+        """The unit (N,) of each intersection of the map."""
+        return cut_to_units(self.index.xy)
 
     @cached_property
     def unrestricted(self) -> TripleEstimator | None:
@@ -137,6 +149,9 @@ class TripleEstimator:
         sweeps = [self.sweeps.rounds(self, source) for source in sources]
         if self.proposed is not None:
             yield iter([self.proposed])
+        if self.in_company:
+            yield from sweeps[:1]
+            return
         if not by_roads:
             yield from sweeps
             return
@@ -163,9 +178,7 @@ class TripleEstimator:
     def _rounds_of_roads(self) -> Iterator[list[Place]]:
         """Yield places that grew by roads and were not met before."""
         met: list[Place] = []
-        options, turnout = self.options, self.sweeps.turnout(self.index.coarseness)
-        roads = RoadSearch(self.scene, self.index, options.camera, self.near, self.sweeps.ahead, turnout)
-        for anchor, n_tried, n_proposed, grown in roads.rounds():
+        for anchor, n_tried, n_proposed, grown in self._votes_of_roads():
             self._count(n_tried)
             self.n_hypotheses += n_proposed
             self._look_for(anchor)
@@ -178,6 +191,17 @@ class TripleEstimator:
             met += fresh
             self.events.note("grown", [place.matrix for place in fresh])
             yield fresh
+
+    def _votes_of_roads(self) -> Iterator[RoadRound]:
+        """Yield the rounds of a search by roads: of each unit, where the map is searched alone."""
+        camera, ahead = self.options.camera, self.sweeps.ahead
+        if not self.sweeps.alone:
+            turnout = self.sweeps.turnout(self.index.coarseness)
+            yield from RoadSearch(self.scene, self.index, camera, self.near, ahead, turnout).rounds()
+            return
+        for unit in range(n_units(len(self.index))):
+            (own,) = np.nonzero(self.units == unit)
+            yield from RoadSearch(self.scene, self.index, camera, self.near, ahead, Turnout(len(own)), own).rounds()
 
     def _look_for(self, anchor: int) -> None:
         """Count an intersection of the query that is looked up on the map."""
@@ -202,7 +226,8 @@ class TripleEstimator:
 
     def enough(self) -> bool:
         """Return whether the limit of screened places, for a map as large as all parts together, is reached."""
-        larger_by = larger(max(self.ledger.n_reference, len(self.index)))
+        n = max(self.ledger.n_reference, len(self.index))
+        larger_by = n_units(n) if self.sweeps.alone else larger(n)
         return self.ledger.n_by_triples >= int(self.options.max_places * larger_by)
 
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:

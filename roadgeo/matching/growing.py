@@ -104,6 +104,10 @@ class Member(Protocol):
 
     index: ReferenceIndex
 
+    @property
+    def units(self) -> IntArray:
+        """The unit (N,) of each intersection of the map."""
+
     def allow(self, proposals: Proposals) -> BoolArray:
         """Return which proposals (M,) the hints allow."""
 
@@ -138,9 +142,10 @@ class SharedSweeps:
         scene: Scene,
         camera: CameraOptions,
         ahead: Ahead = ALONE,
+        alone: bool = False,
     ) -> None:
-        """Begin without parts."""
-        self.scene, self.camera, self.ahead = scene, camera, ahead
+        """Begin without parts; `alone`: of one, each unit of which has all of the bounds (see `cut_to_units`)."""
+        self.scene, self.camera, self.ahead, self.alone = scene, camera, ahead, alone
         self.members: list[Member] = []
         self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
         self._done: dict[int, list[_Grown]] = {}
@@ -177,6 +182,8 @@ class SharedSweeps:
         if self.members[0].enough():
             return
         indexes = [member.index for member in self.members]
+        if self.alone:
+            sweep = sweep.of_each_unit(len(indexes[0]))
         for proposals in sweep.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio, self.ahead):
             if self.members[0].enough():
                 return
@@ -184,9 +191,18 @@ class SharedSweeps:
 
     def _grow(self, proposals: Sequence[Proposals]) -> _Grown:
         """Grow an anchor's proposals on all parts; return the best places that grew, by the part's identity."""
+        allowed = [member.allow(own) for member, own in zip(self.members, proposals, strict=True)]
+        if not self.alone:
+            return self._grow_best(proposals, allowed)
+        member, units, places = self.members[0], self.members[0].units[proposals[0].reference], list[Place]()
+        for unit in np.unique(units[allowed[0]]).tolist():
+            places += self._grow_best(proposals, [allowed[0] & (units == unit)]).get(id(member), [])
+        return {id(member): places}
+
+    def _grow_best(self, proposals: Sequence[Proposals], allowed: Sequence[BoolArray]) -> _Grown:
+        """Grow the allowed proposals, within the bounds of an anchor."""
         members = self.members
         # The best placed are screened ...
-        allowed = [member.allow(own) for member, own in zip(members, proposals, strict=True)]
         placed = [own.placed[may] for own, may in zip(proposals, allowed, strict=True)]
         kept = [
             member.screen(own, may, most)

@@ -210,6 +210,19 @@ class ReferenceIndex:
         near = np.concatenate(parts)
         return np.asarray(near[np.abs(near - middle).max(axis=1) < reach_m])
 
+    def segments_within(self, low: FloatArray, high: FloatArray) -> Float32Array:
+        """Return (M, 4) the segments of roads whose bounds touch a box of the plane; its buckets alone are read."""
+        segments, starts, ids, (x0, y0, size), (columns, rows) = self.road_buckets
+        ends = np.nan_to_num([low, high], nan=np.inf, posinf=np.inf, neginf=-np.inf)
+        cells = np.clip(np.floor((ends - (x0, y0)) / size), 0, (columns - 1, rows - 1)).astype(int)
+        (left, bottom), (right, top) = cells
+        in_rows = columns * np.arange(bottom, top + 1)
+        parts = [ids[a:b] for a, b in zip(starts[in_rows + left], starts[in_rows + right + 1], strict=True)]
+        near = segments[np.unique(np.concatenate(parts))]
+        a, b = near[:, :2], near[:, 2:]
+        outside = (np.minimum(a, b) > high).any(axis=1) | (np.maximum(a, b) < low).any(axis=1)
+        return np.asarray(near[~outside])
+
     def arrays(self) -> dict[str, AnyArray]:
         """All arrays by name, for writing."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in {"meta", "path"}}

@@ -28,8 +28,8 @@ from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import Rivals
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
-from roadgeo.matching.search import Ahead, Search, search_together
-from roadgeo.matching.triples import larger
+from roadgeo.matching.search import Ahead, Search, search_in_turn, search_together
+from roadgeo.matching.triples import larger, n_units
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
@@ -166,7 +166,11 @@ def _search(
         if one.estimator is not None and proposed:
             here = (matrix for index, matrix in proposed if index is one.index)
             one.estimator.proposed = [Place(query.scene, one.estimator.index, matrix) for matrix in here]
-    estimators = {Search(one.estimator): one.estimator for one in begun if one.estimator is not None}
+    together = [one.estimator for one in begun if one.estimator is not None]
+    units = sum(n_units(len(estimator.index)) for estimator in together)
+    for estimator in together:
+        estimator.in_company = units > 1
+    estimators = {Search(estimator): estimator for estimator in together}
     ledger.n_reference = sum(one.n_searched for one in begun if one.estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
@@ -175,8 +179,34 @@ def _search(
     rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, rivals)
     sweeps.end()
+    if units > 1 and not any(search.stopped in ("accepted", "time") for search in estimators):
+        left, scale = left - (time.perf_counter() - started), float(units)
+        estimators = _search_alone(together, options, ledger, left)
+        rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     searches = iter(estimators)
     return [one if one.estimator is None else _end(one, one.estimator, next(searches), rivals, scale) for one in begun]
+
+
+def _search_alone(
+    estimators: Sequence[TripleEstimator], options: LocateOptions, ledger: Ledger, time_limit_s: float
+) -> dict[Search[Place], TripleEstimator]:
+    """Search each part, and each unit of it, as if it were alone, a stage of each in turn.
+
+    The more is searched in all, by the `ledger`, the more a place must lead.
+    """
+    for estimator in estimators:
+        estimator.leave_company()
+    searches = {Search(estimator): estimator for estimator in estimators}
+    rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
+    work_s = options.search.work_limit_s
+    limits = [
+        replace(options.search, time_limit_s=time_limit_s, work_limit_s=n_units(len(estimator.index)) * work_s)
+        for estimator in estimators
+    ]
+    search_in_turn(list(searches), limits, lambda search: rivals([search]) is not None)
+    for estimator in estimators:
+        estimator.sweeps.end()
+    return searches
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:

@@ -283,9 +283,7 @@ def _length_px(cell_m: float, gsd_m: float) -> float:
 def draw_roads(index: ReferenceIndex, low: FloatArray, high: FloatArray, cell_m: float) -> Ground:
     """Draw the map's roads within a box of the plane."""
     columns, rows = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
-    a, b = index.segments[:, :2], index.segments[:, 2:]
-    outside = (np.minimum(a, b) > high).any(axis=1) | (np.maximum(a, b) < low).any(axis=1)
-    lines = index.segments[~outside].astype(float).reshape(-1, 2, 2) - low
+    lines = index.segments_within(low, high).astype(float).reshape(-1, 2, 2) - low
     canvas = np.zeros((int(rows), int(columns)), np.uint8)
     ends = np.round(lines / cell_m * 16.0 - 8.0).astype(np.int32)
     cv2.polylines(canvas, list(ends), False, 255, max(1, round(_ROAD_M / cell_m)), cv2.LINE_AA, 4)

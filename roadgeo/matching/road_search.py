@@ -429,10 +429,11 @@ class RoadSearch:
         near: tuple[float, float, float] | None = None,
         ahead: Ahead = ALONE,
         turnout: Turnout | None = None,
+        among: IntArray | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
-        Parts that are searched together share the `turnout`.
+        Parts that are searched together share the `turnout`. `among` (M,): the map's intersections that are compared.
         """
         coarseness = index.coarseness
         self.scene, self.ahead = scene, ahead
@@ -441,6 +442,7 @@ class RoadSearch:
         center, off = camera.heading or (0.0, 180.0)
         heading = math.radians(center), math.radians(min(off + AGREE_DEG, 180.0))
         candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
+        candidates = candidates if among is None else np.intersect1d(candidates, among, assume_unique=True)
         self.voter = Voter(scene, index, scale, heading, candidates)
         self.grower = RoadGrower(scene, index, camera)
 

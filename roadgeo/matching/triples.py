@@ -31,8 +31,10 @@ __all__ = [
     "Proposals",
     "Sweep",
     "TripleOptions",
+    "cut_to_units",
     "farthest_first",
     "larger",
+    "n_units",
     "propose",
     "smaller",
 ]
@@ -50,6 +52,27 @@ def larger(n_reference: int) -> float:
 def smaller(n_reference: int) -> float:
     """Return max(1, sqrt(15,000 / n)): the same for maps smaller than a city's."""
     return math.sqrt(max(1.0, _USUAL_SIZE / max(n_reference, 1)))
+
+
+def n_units(n_reference: int) -> int:
+    """Return how many units of usual size a map of n intersections has: each is searched as a map of its own."""
+    return max(1, round(n_reference / _USUAL_SIZE))
+
+
+def cut_to_units(xy: FloatArray) -> IntArray:
+    """Return the unit (N,) of each intersection, (N, 2): a compact piece of the map, of about the usual size."""
+    unit = np.zeros(len(xy), np.int64)
+    pieces = [(np.arange(len(xy)), 0, n_units(len(xy)))]
+    while pieces:
+        rows, first, n = pieces.pop()
+        if n == 1:
+            unit[rows] = first
+            continue
+        axis = int(np.ptp(xy[rows], axis=0).argmax())
+        order = rows[np.argsort(xy[rows, axis], kind="stable")]
+        cut = len(rows) * (n // 2) // n
+        pieces += [(order[:cut], first, n // 2), (order[cut:], first + n // 2, n - n // 2)]
+    return unit
 
 
 #: Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
@@ -192,6 +215,12 @@ class Sweep:
     triples: TripleOptions
     max_anchors: int
     most_more: float = 3.0
+
+    def of_each_unit(self, n_reference: int) -> Sweep:
+        """Return the sweep with bounds that grow with the units of a map, not with their root."""
+        more, triples = n_units(n_reference) / larger(n_reference), self.triples
+        hits, compared = int(more * triples.max_hits), int(more * triples.max_compared)
+        return replace(self, triples=replace(triples, max_hits=hits, max_compared=compared)) if more > 1.0 else self
 
     def proposals(
         self,

@@ -59,7 +59,7 @@ def _judge(query: Query, found: Sequence[Searched], options: LocateOptions) -> L
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
     # The best place of all references, and the others.
-    candidates = _pool(found)
+    candidates = _pool(found, options.min_log10_odds)
     best, rivals = (candidates[0] if candidates else None), candidates[1:]
     listed = _listed(found, candidates)
     places = tuple(_describe(location, query, listed, number, options) for number in range(1, 1 + len(listed)))
@@ -70,7 +70,7 @@ def _judge(query: Query, found: Sequence[Searched], options: LocateOptions) -> L
     rival = None if best is None else _equal(best, rivals, needed)
     if best is None or (best.score < needed and rival is None):
         return _refuse(replace(location, alternatives=places), query, found, listed, options)
-    best = _against(best, rivals)
+    best = _against(best, rivals, needed)
     placed = place_frame(_on(location, best.index), query, best, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
     if rival is not None:
@@ -124,12 +124,14 @@ def _on(location: Location, index: ReferenceIndex) -> Location:
     return replace(location, reference=index.name, attribution=str(index.meta.get("attribution") or ""))
 
 
-def _pool(found: Sequence[Searched]) -> list[Hyp]:
+def _pool(found: Sequence[Searched], needed: float) -> list[Hyp]:
     """Return the places of all references, the best first; a place on overlapping parts occurs once.
 
-    Places on different references are ranked by likelihood.
+    Leads compete: a place that leads its own map comes before all that do not. Those that do are ranked by likelihood.
     """
-    return _distinct([place for one in found for place in one.compared])
+    pool = [place for one in found for place in one.compared]
+    leading = _distinct([place for place in pool if place.score >= needed])
+    return leading + _distinct([place for place in pool if place.score < needed], leading)
 
 
 def _distinct(pool: Sequence[Hyp], known: Sequence[Hyp] = ()) -> list[Hyp]:
@@ -170,9 +172,10 @@ def _seen_from(best: Hyp, rival: Hyp) -> Place:
     return replace(center, x=float(x), y=float(y))
 
 
-def _against(best: Hyp, rivals: Sequence[Hyp]) -> Hyp:
-    """Return a place with its lead over the places on all references."""
-    leads = [best.explained - one.explained for one in rivals if one.index is not best.index]
+def _against(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp:
+    """Return a place with its lead over the places on all references that lead their own."""
+    others = [one for one in rivals if one.index is not best.index and one.score >= needed]
+    leads = [best.explained - one.explained for one in others]
     return best.but(score=min([best.score, *(lead / best.statement_px for lead in leads)]))
 
 
@@ -184,7 +187,7 @@ def _equal(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp | None:
     """
     if best.score < needed:
         return next((one for one in rivals if _are_alike(best, one)), None)
-    return next((one for one in rivals if _against(best, [one]).score < needed), None)
+    return next((one for one in rivals if _against(best, [one], needed).score < needed), None)
 
 
 def _are_alike(best: Hyp, rival: Hyp) -> bool:

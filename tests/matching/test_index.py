@@ -352,3 +352,14 @@ def test_what_lies_near_is_found_in_the_buckets_there(town, reach_m, away_m):
     middle = index.xy.mean(axis=0) + away_m
     slowly = index.xy[np.abs(index.xy - middle).max(axis=1) < reach_m]
     assert np.array_equal(index.within(middle, reach_m), slowly)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e6])
+def test_the_roads_within_a_box_are_those_whose_bounds_touch_it(town, beyond):
+    index, rng = town[1], np.random.default_rng(7)
+    a, b = index.segments[:, :2], index.segments[:, 2:]
+    for _ in range(5):
+        low = rng.uniform(-200.0, 3800.0, 2) + beyond
+        high = low + rng.uniform(1.0, 900.0, 2)
+        touches = ((np.minimum(a, b) <= high) & (np.maximum(a, b) >= low)).all(axis=1)
+        np.testing.assert_array_equal(index.segments_within(low, high), index.segments[touches])
