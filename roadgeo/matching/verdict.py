@@ -245,11 +245,13 @@ def _refuse(
         return replace(_on(location, nearest.index), reason=reason)
     names = ", ".join(distinct)
     owed = dict.fromkeys(_on(location, one.index).attribution for one in found)
+    cut_short = {one.index.name for one in found if one.stopped != "exhausted"}
+    done = f"{len(distinct) - len(cut_short)} of {len(distinct)} maps searched to the end"
     return replace(
         location,
         reference=names,
         attribution="; ".join(filter(None, owed)),
-        reason=f"{reason} (looked on {names})",
+        reason=f"{reason} (looked on {names}; {done})",
     )
 
 

@@ -4,18 +4,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from worlds.scenes import camera, look, random_network, scene_of
+from worlds.scenes import Sight, camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.location import Seconds
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import search_references
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.parts import Whole
 from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import Rivals
+from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Search, SearchOptions, search_together
-from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions
+from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions, cut_to_units, n_units
 
 
 @dataclass(eq=False)
@@ -174,3 +179,54 @@ def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     parts = search_all(stranger, indexes, options)
     assert sum(part.estimator.n_screened for part in parts) <= 3 * 50
     assert sum(part.estimator.n_verified for part in parts) <= 3 * growing.MAX_VERIFIED
+
+
+# --- each unit of a part that is searched alone -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "units"), [(1, 1), (22_000, 1), (23_000, 2), (45_000, 3), (160_000, 11)])
+def test_a_large_map_is_cut_to_compact_units_of_a_citys_size(n, units):
+    xy = np.random.default_rng(5).uniform(0.0, 1000.0, (n, 2)) * (3.0, 1.0)
+    unit = cut_to_units(xy)
+    sizes = np.bincount(unit)
+    assert (len(sizes), n_units(n)) == (units, units)
+    assert sizes.max() - sizes.min() <= units
+    areas = sum(float(np.prod(np.ptp(xy[unit == k], axis=0))) for k in range(units))
+    assert areas <= 3.0e6  # they do not overlap
+    assert max(float(np.ptp(xy[unit == k], axis=0).max()) for k in range(units)) <= 1.2 * 3000.0 / units**0.5
+
+
+def test_each_unit_of_a_part_alone_has_all_of_the_bounds(monkeypatch):
+    monkeypatch.setattr(growing, "MAX_SCREENED", 4)
+    monkeypatch.setattr(growing, "MAX_VERIFIED", 2)
+    part = Part([[9, 8, 7, 6, 5, 4]])
+    part.units = np.array([0, 0, 0, 0, 0, 1])  # of the map's intersections, one for each proposal
+    seen = []
+    part.screen = lambda _, allowed, most: (seen.append(most), np.flatnonzero(allowed)[:most])[1]
+    sweeps = SharedSweeps(None, CameraOptions(), alone=True)
+    sweeps.members.append(part)
+    sweep = Plan([part])
+    sweep.of_each_unit = lambda _: sweep
+    part.index = part.units
+    (found,) = sweeps.rounds(part, sweep)
+    assert seen == [4, 1]
+    assert supports(found) == [9.0, 8.0, 4.0]
+
+
+def test_bounds_of_triples_grow_with_the_units():
+    sweep = Sweep(TripleOptions(max_hits=100, max_compared=1000), 12)
+    assert sweep.of_each_unit(15_000) is sweep
+    assert sweep.of_each_unit(60_000).triples.bounds(60_000) == (400, 4000)
+
+
+def test_a_broken_mask_is_found_in_company_as_it_is_alone(towns):
+    networks, indexes = towns
+    graph = look(networks[2], TRUTH, (1000, 1000), Sight(1.0, missing=0.45, false=0.3))
+    scene = scene_of(graph)
+    query = Query("broken", scene, graph, Seconds())
+    alone, company = (
+        search_references(query, [Whole(index) for index in some], LocateOptions(), 60.0)
+        for some in (indexes[2:3], indexes)
+    )
+    assert [one.stopped == "accepted" for one in company] == [False, False, True, False]
+    assert company[2].places[0].score > 0.9 * alone[0].places[0].score > 3.5
