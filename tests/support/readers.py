@@ -21,7 +21,7 @@ import pyproj
 import shapely
 from starlette.exceptions import HTTPException
 
-from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Read
+from roadgeo.cli.options import BOX, GSD, NEAR, RANGE, Read
 from roadgeo.cli.track import TIME
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
@@ -212,7 +212,6 @@ _HINTS = {
     b"R": RANGE.convert,
     b"C": Read("focal", HINTS["focal"].read).convert,
     b"G": GSD.convert,
-    b"A": ASPECT.convert,
     b"M": TIME.convert,
     b"T": lambda text, *_: read_truths(text, explain=True),
 }
