@@ -1,7 +1,7 @@
-"""Many tasks on a Dask cluster: results in the order of the tasks, as from one process; a worker that dies costs none.
+"""Tasks on a Dask cluster, for a pool.
 
-No more tasks are under way than keep all workers busy, whatever their number. Dask does a task again on another worker
-where one dies; a task that kills worker after worker is done once more with nothing beside it, then given up.
+Dask does a task again on another worker where one dies, and blames all that a dead worker had: a task that kills worker
+after worker is done once more with nothing beside it, then given up.
 
 Workers read the same files under the same paths. Each has one thread; kernels are compiled on each host once.
 """
@@ -11,21 +11,21 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import threading
 import uuid
-from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
+from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
-from roadgeo.running.processes import Work, outlive, without_interrupts
+from roadgeo.running.pool import Died, Pool, Work
+from roadgeo.running.processes import without_interrupts
 from roadgeo.storage.folders import private_temporary_dir
 
-__all__ = ["Cluster", "Made", "do_prepared"]
+__all__ = ["Cluster", "DaskWorkers"]
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -35,8 +35,6 @@ _AHEAD = 2
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
-
-_DIED = "the workers that it was given to died, one after another"
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,7 @@ class Cluster:
             Dask is not installed; there is no scheduler at the address, or it went away.
         """
         with self.connected() as client:
-            from distributed.scheduler import KilledWorker
-
-            yield from outlive(tasks, work, partial(_in_order, client, Made.of(work)), KilledWorker, _DIED)
+            yield from Pool[Task, Result](DaskWorkers(client, work)).run(tasks, work)
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[Any]:
@@ -119,28 +115,51 @@ def _local_cluster(workers: int) -> Iterator[Any]:
         yield cluster
 
 
-def _in_order(client: Any, made: Made, tasks: Sequence[Any]) -> Iterator[Any]:
-    """Yield the results of tasks in order."""
-    from distributed import wait
-    from distributed.scheduler import KilledWorker
+class DaskWorkers:
+    """The workers of a cluster, ready for one kind of work (see `pool.Workers`)."""
 
-    # Dask's executor fails where a worker dies that holds a result that was just read.
-    waiting, under_way = iter(tasks), deque[Any]()
-    try:
-        while True:
-            room = _AHEAD * len(client.nthreads()) + 1 - len(under_way)  # workers come and go
-            under_way += [client.submit(do_prepared, made, task, pure=False) for task in islice(waiting, max(room, 0))]
-            if not under_way:
-                return
-            yield under_way.popleft().result()
-    except KilledWorker:
-        with contextlib.suppress(CancelledError):
-            wait(list(under_way))  # the scheduler blames all that a dead worker had: nothing runs beside the suspect
-        raise
-    except (CancelledError, OSError) as error:
-        raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
-    finally:
-        for future in under_way:
+    died = "the workers that it was given to died, one after another"
+
+    def __init__(self, client: Any, work: Any) -> None:
+        """Take them as Dask's client knows them."""
+        self._client, self._made, self._under_way = client, Made.of(work), set[Any]()
+
+    def names(self) -> list[str]:
+        """Return their addresses, in order; at least one."""
+        return sorted(self._client.nthreads()) or [""]
+
+    def busy(self) -> int:
+        """Return how many tasks keep them busy."""
+        return _AHEAD * len(self._client.nthreads()) + 1
+
+    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:  # noqa: ARG002
+        """Have one do a task, the one whose address is `task.worker` if it is there.
+
+        Raises
+        ------
+        Died
+            Worker after worker died.
+        RoadgeoError
+            The scheduler went away.
+        """
+        from distributed.scheduler import KilledWorker
+
+        worker = getattr(task, "worker", "")
+        where = {"workers": [worker], "allow_other_workers": True} if worker else {}
+        future = self._client.submit(do_prepared, self._made, task, pure=False, **where)
+        self._under_way.add(future)
+        try:
+            return future.result()
+        except KilledWorker as error:
+            raise Died from error
+        except (CancelledError, OSError) as error:
+            raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
+        finally:
+            self._under_way.discard(future)
+
+    def close(self) -> None:
+        """Call off what is under way."""
+        for future in list(self._under_way):
             future.cancel()
 
 
@@ -163,7 +182,7 @@ class Made:
         return cls(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work))
 
 
-def do_prepared(made: Made, *task: Any) -> Any:
+def do_prepared(made: Made, task: Any) -> Any:
     """Do a task in the folder where it was asked for; make its work and this worker ready first, once."""
     if made.token not in _prepared:
         os.chdir(made.folder)
@@ -176,7 +195,7 @@ def do_prepared(made: Made, *task: Any) -> Any:
             warm_up()
         _prepared.clear()  # of earlier runs, whose maps are no longer needed
         _prepared[made.token] = pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
-    return _prepared[made.token](*task)
+    return _prepared[made.token](task)
 
 
 @contextlib.contextmanager

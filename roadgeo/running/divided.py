@@ -16,8 +16,8 @@ nearest.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
@@ -33,7 +33,8 @@ from roadgeo.matching.triples import larger
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.running.batch import Locating, Outcome, open_references
-from roadgeo.running.cluster import Cluster, Made, do_prepared
+from roadgeo.running.cluster import Cluster, DaskWorkers
+from roadgeo.running.pool import Lost, Pool
 from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
@@ -60,6 +61,16 @@ def owners(parts: Sequence[str], workers: Sequence[str]) -> dict[str, list[str]]
     return owned
 
 
+class _Parts(NamedTuple):
+    """Parts to search, best by one worker; all places are less likely by `against` (log10), for the rest of the map."""
+
+    worker: str
+    query: Query
+    names: Sequence[str]
+    options: LocateOptions
+    against: float
+
+
 class _Answer(NamedTuple):
     """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part."""
 
@@ -81,7 +92,8 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
     able = {name: part for name, part in parts.items() if may_show(part, options, math.inf)} or parts
     sizes = {name: _size(part) for name, part in able.items()}
     with cluster.connected() as client, Ahead(_AHEAD) as ahead:
-        locate = partial(_locate, client, Made.of(_Map(locating.references)), sizes)
+        workers = DaskWorkers(client, _Map(locating.references))
+        locate = partial(_locate, Pool(workers), workers.names, sizes)
         yield from ahead.map(lambda task: locating.do(task, asked, locate), tasks)
 
 
@@ -103,8 +115,8 @@ def _size(part: Part) -> int:
 
 
 def _locate(
-    client: Any,
-    made: Made,
+    pool: Pool[_Parts, _Answer],
+    workers: Callable[[], Sequence[str]],
     sizes: Mapping[str, int],
     mask: RoadMask,
     references: Sequence[AnyReference],
@@ -120,36 +132,36 @@ def _locate(
     query = read_query(mask)
     # Each of the three searches may take the time limit: waiting for a worker that is busy with other masks is no part.
     limits = replace(options.search, time_limit_s=max(options.search.time_limit_s - query.seconds.vectorize, 0.0))
-    options, workers = replace(options, search=limits), sorted(client.nthreads()) or [""]
+    options, here = replace(options, search=limits), workers()
 
     def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> list[_Answer]:
-        futures = []
-        for worker, parts in searched.items():
-            here = sum(sizes[name] for name in parts)
-            against = 2.0 * math.log10(larger(sum(sizes.values())) / larger(here))  # as in `Rivals`, for the whole map
-            how = {"pure": False, "workers": [worker], "allow_other_workers": True}
-            futures.append(client.submit(do_prepared, made, query, parts, options, against, **how))
-        return [future.result() for future in futures]
+        asked = []
+        for worker, names in searched.items():
+            share = larger(sum(sizes.values())) / larger(sum(sizes[name] for name in names))
+            against = 2.0 * math.log10(share)  # as in `Rivals`, for the whole map
+            asked.append(_Parts(worker, query, names, options, against))
+        with ThreadPoolExecutor(len(asked)) as threads:
+            return [_answer_of(answer, query) for answer in threads.map(pool.do, asked)]
 
-    all_parts = owners(list(sizes), workers)
+    all_parts = owners(list(sizes), here)
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
-    try:
-        answers = search(all_parts, replace(options, effort="quick", search=least_work))
-        if not any(answer.location.located for answer in answers):
-            answers = search(all_parts, options)
-        best = max(answers, key=_rank)
-        if best.location.status == "not_located":
-            return _refused_by_all(best.location, [answer.location for answer in answers], references)
-        places = sorted((place for answer in answers for place in answer.places), reverse=True)
-        # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
-        chosen = list(dict.fromkeys(part for _, part in places)) or best.parts
-        return search({next(iter(owners(chosen[:1], workers))): chosen}, options)[0].location
-    except (CancelledError, OSError) as error:
-        raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
-    except Exception as error:
-        if type(error).__name__ != "KilledWorker":
-            raise
-        raise RoadgeoError(f"{query.name}: the workers that hold parts of the map died, again and again") from error
+    answers = search(all_parts, replace(options, effort="quick", search=least_work))
+    if not any(answer.location.located for answer in answers):
+        answers = search(all_parts, options)
+    best = max(answers, key=_rank)
+    if best.location.status == "not_located":
+        return _refused_by_all(best.location, [answer.location for answer in answers], references)
+    places = sorted((place for answer in answers for place in answer.places), reverse=True)
+    # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
+    chosen = list(dict.fromkeys(part for _, part in places)) or best.parts
+    return search({next(iter(owners(chosen[:1], here))): chosen}, options)[0].location
+
+
+def _answer_of(answer: _Answer | Lost, query: Query) -> _Answer:
+    """Refuse to answer without a part of the map."""
+    if isinstance(answer, Lost):
+        raise RoadgeoError(f"{query.name}: a part of the map has no answer: {answer.said}")
+    return answer
 
 
 def _rank(answer: _Answer) -> tuple[bool, float]:
@@ -188,11 +200,12 @@ class _Searcher:
 
     parts: Mapping[str, Part]
 
-    def __call__(self, query: Query, names: Sequence[str], options: LocateOptions, against: float) -> _Answer:
-        """Search parts together; all places are less likely by `against` (log10), for the rest of the map."""
+    def __call__(self, asked: _Parts) -> _Answer:
+        """Search parts together."""
+        query, names, options = asked.query, asked.names, asked.options
         parts = [self.parts[name] for name in names]
         found = search_references(query, parts, options, options.search.time_limit_s)
-        found = [result.less_likely(against) for result in found]
+        found = [result.less_likely(asked.against) for result in found]
         least = options.min_log10_odds - options.min_margin
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
         strong = [place for result in found for place in result.compared if place.score >= least]

@@ -1,99 +1,54 @@
-"""Many tasks in one process or several: results in the order of the tasks; a process that dies costs one of them."""
+"""Processes of this machine that do tasks for a pool, each made ready once; and many tasks in them, or in this one."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
+import queue
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, TypeVar
 
+from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
+from roadgeo.running.pool import Died, Ended, Pool, Work
 from roadgeo.storage.files import remove_own
 
-__all__ = ["Work", "end_with_parent", "outlive", "run", "without_interrupts"]
+__all__ = ["Processes", "end_with_parent", "run", "tell", "without_interrupts"]
 
 Task = TypeVar("Task")
-TaskIn = TypeVar("TaskIn", contravariant=True)
 Result = TypeVar("Result")
-ResultOut = TypeVar("ResultOut", covariant=True)
 
 #: Modules that nearly every task needs: a fork server loads them once for all processes.
 _PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"]
 
-
-#: Time in which a process whose parent is gone removes half-written files.
+#: Time in which a process that is to end, or whose parent is gone, removes half-written files.
 _GRACE_S = 5.0
-
-
-class Work(Protocol[TaskIn, ResultOut]):
-    """The work done for each task; it travels to other processes, so it can be pickled."""
-
-    def prepare(self) -> Callable[[TaskIn], ResultOut]:
-        """Make a process ready (open the references) and return the function that does one task."""
-
-    def give_up(self, task: TaskIn, reason: str) -> ResultOut:
-        """Make the result of a task whose process died."""
+#: Time to become ready.
+_START_S = 120.0
+#: Interval of checks whether somebody still waits.
+_GLANCE_S = 0.25
 
 
 def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
-    """Do all tasks and yield their results in the order of the tasks, each as soon as it and those before it are there.
+    """Do all tasks in one process or several, and yield their results in the order of the tasks.
 
     A process that dies (out of memory, a crash in a library) costs one result, not the others.
     """
-    if jobs == 1 or len(tasks) == 1:
-        do = work.prepare()
-        yield from map(do, tasks)
+    if jobs == 1 or len(tasks) <= 1:
+        yield from map(work.prepare(), tasks) if tasks else ()
         return
     _require_guard()
-    together = functools.partial(_run_together, work=work, jobs=jobs)
-    yield from outlive(tasks, work, together, BrokenProcessPool, "the process that worked on it died (out of memory?)")
-
-
-def outlive(
-    tasks: Sequence[Task],
-    work: Work[Task, Result],
-    together: Callable[[Sequence[Task]], Iterator[Result]],
-    died: type[Exception],
-    reason: str,
-) -> Iterator[Result]:
-    """Yield the results of all tasks in order, though processes die of some: these are given up.
-
-    Parameters
-    ----------
-    together : callable
-        Does tasks in other processes, and yields their results in order.
-    died : type
-        Raised by `together` where processes died. Any task then running may be to blame, so the first that has no
-        result runs again, alone.
-    reason : str
-        Why a task is given up.
-    """
-    rest = list(tasks)
-    while rest:
-        done = 0
-        try:
-            for result in together(rest):
-                yield result
-                done += 1
-        except died:
-            suspect = rest[done]
-            try:
-                yield from together([suspect])
-            except died:
-                yield work.give_up(suspect, reason)
-            done += 1
-        rest = rest[done:]
+    yield from Pool[Task, Result](Processes(work, min(jobs, len(tasks)))).run(tasks, work)
 
 
 def _require_guard() -> None:
@@ -113,48 +68,242 @@ def _require_guard() -> None:
             )
 
 
-def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
-    # A fork server loads the libraries once for all; elsewhere each process starts afresh.
-    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-    context = multiprocessing.get_context(method)
-    if method == "forkserver":
-        context.set_forkserver_preload(_PRELOAD)
-    workers = min(jobs, len(tasks))
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(work,)) as pool:
+class Processes:
+    """Processes of this machine, each ready for one kind of work (see `pool.Workers`)."""
+
+    died = "the process that worked on it died (out of memory?)"
+
+    def __init__(
+        self, work: Work[Any, Any], count: int, *, grace_s: float = _GRACE_S, clean: Callable[[], None] | None = None
+    ) -> None:
+        """Start them.
+
+        Parameters
+        ----------
+        grace_s : float
+            Time for half-written files to be removed in the end.
+        clean : callable, optional
+            What they do where this process is killed.
+        """
+        self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
+        self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        self._all = [_Process(work, clean) for _ in range(count)]
         try:
-            with without_interrupts():
-                futures = [pool.submit(_do, task) for task in tasks]
-            for future in futures:
-                yield future.result()
+            for process in self._all:
+                process.start()
+                self._idle.put(process)
         except BaseException:
-            for process in list((pool._processes or {}).values()):  # ours alone: a program may have others
-                process.terminate()
-            pool.shutdown(cancel_futures=True)
+            self.close()
             raise
 
+    def busy(self) -> int:
+        """Return how many tasks keep them busy: each has one, and the next one waits."""
+        return 2 * len(self._all)
 
-_prepared: list[Callable[[Any], Any]] = []
+    def wait_until_ready(self) -> None:
+        """Wait until all have prepared; raises what the first raised that could not.
+
+        Raises
+        ------
+        Died, Ended
+            One died meanwhile, or took too long.
+        """
+        for process in self._all:
+            process.become_ready()
+
+    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+        """Have the next one that is free do a task. One that fails at that is started anew."""
+        process = self._idle.get()
+        try:
+            if called_off.is_set():
+                raise Ended("called off", "it was called off")
+            self._start(process)
+            done, result = self._ask(process, task, patience_s, say, called_off)
+        finally:
+            self._idle.put(process)
+        if not done:
+            raise result
+        return result
+
+    def _ask(self, process: _Process, *asked: Any) -> tuple[bool, Any]:
+        try:
+            process.become_ready()
+            return process.ask(*asked)
+        except BaseException as error:
+            process.end(0.0)
+            if isinstance(error, Died | Ended):
+                with contextlib.suppress(Ended):
+                    self._start(process)
+            raise
+
+    def _start(self, process: _Process) -> None:
+        """Start a process that has ended, unless all are to end."""
+        with self._lock:
+            if self._closed:
+                raise Ended("no worker", "it is ending")
+            try:
+                process.start()
+            except OSError as error:
+                raise Ended("no worker", f"no process can be started: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """End all."""
+        with self._lock:
+            self._closed = True
+            for process in self._all:
+                process.tell_to_end()
+            until = time.monotonic() + self._grace_s
+            for process in self._all:
+                process.end(until - time.monotonic())
 
 
-def _start_worker(work: Work[Any, Any]) -> None:
-    """Make a worker ready. Ctrl-C is the parent's to handle: it ends the workers, which clean up as they go."""
+class _Process:
+    """One process, and the pipe to it."""
+
+    def __init__(self, *given: Any) -> None:
+        self._given = given
+        self.process: Any = None
+        self._is_ready = False
+
+    def start(self) -> None:
+        """Start it where it is not.
+
+        Raises
+        ------
+        OSError
+            The system has no room for it.
+        """
+        if self.process is not None:
+            return
+        # A fork server loads the libraries once for all; elsewhere each process starts afresh.
+        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+        context: Any = multiprocessing.get_context(method)
+        if method == "forkserver":
+            context.set_forkserver_preload(_PRELOAD)
+        ours, theirs = context.Pipe()
+        try:
+            process = context.Process(target=_serve, args=(theirs, *self._given), daemon=True)
+            with without_interrupts():
+                process.start()
+        finally:
+            theirs.close()
+        self._pipe, self.process, self._is_ready = ours, process, False
+
+    def become_ready(self) -> None:
+        """Wait until it has prepared; raises what that raises.
+
+        Raises
+        ------
+        Died, Ended
+            It died meanwhile, or takes too long.
+        """
+        if not self._is_ready:
+            self._is_ready, error = self._hear(_START_S, say_nothing, threading.Event())
+            if error is not None:
+                raise error
+
+    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> tuple[bool, Any]:
+        """Return whether a task is done, and its result or error.
+
+        Raises
+        ------
+        Died, Ended
+            There is neither.
+        """
+        try:
+            self._pipe.send(task)
+        except OSError as error:
+            raise Died from error
+        return self._hear(patience_s, say, called_off)
+
+    def _hear(self, patience_s: float, say: Say, called_off: threading.Event) -> tuple[bool, Any]:
+        """Wait for an answer, and pass the progress on."""
+        until = time.monotonic() + patience_s
+        while (left := until - time.monotonic()) > 0.0:
+            if called_off.is_set():
+                raise Ended("called off", "it was called off")
+            try:
+                message: Any = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else None
+            except (EOFError, OSError) as error:
+                raise Died from error
+            if isinstance(message, _Said):
+                say(*message)
+            elif message is not None:
+                done, result = message
+                return bool(done), result
+        raise Ended("late", f"longer than {patience_s:g} s")
+
+    def tell_to_end(self) -> None:
+        """Tell it to end."""
+        if (process := self.process) is not None:
+            process.terminate()
+
+    def end(self, grace_s: float) -> None:
+        """End it, at once or after a time in which it may clean up."""
+        process, self.process = self.process, None
+        if process is not None:
+            process.join(max(grace_s, 0.0))
+            process.kill()
+            process.join(_GRACE_S)
+
+
+# --- in the process ---------------------------------------------------------------------------------------------------
+
+
+class _Said(tuple[Any, ...]):
+    """Progress: a text, and a share or None."""
+
+    __slots__ = ()
+
+
+_parents: list[Connection] = []
+
+
+def tell(text: str, share: float | None = None) -> None:
+    """Tell whoever waits for the task that this process does how far it is."""
+    for pipe in _parents:
+        pipe.send(_Said((text, share)))
+
+
+def _serve(pipe: Connection, work: Work[Any, Any], clean: Callable[[], None] | None) -> None:
+    """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
-        end_with_parent()
+        end_with_parent(clean)
         import cv2
 
         cv2.setNumThreads(1)  # the processes share the processors already
-        _prepared.append(work.prepare())
-    except SystemExit:  # the pool would report it as a fault
+        _parents[:] = [pipe]
+        do: Callable[[Any], Any] | None = None
+        try:
+            do = work.prepare()
+        except Exception as error:
+            pipe.send((False, _portable(error)))
+            return
+        pipe.send((True, None))
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                pipe.send(_attempt(do, pipe.recv()))
+    except SystemExit:  # the task has cleaned up
         _leave()
 
 
-def _do(task: Any) -> Any:
+def _attempt(do: Callable[[Any], Any], task: Any) -> tuple[bool, Any]:
+    """Return whether a task is done, and its result or error."""
     try:
-        return _prepared[0](task)
-    except SystemExit:  # the task has cleaned up; the pool would take this for its result, and go on
-        _leave()
+        return True, do(task)
+    except Exception as error:
+        return False, _portable(error)
+
+
+def _portable(error: Exception) -> Exception:
+    """Return an error as it can be sent."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 (from ourselves)
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _leave() -> NoReturn:
@@ -163,7 +312,7 @@ def _leave() -> NoReturn:
     os._exit(128 + signal.SIGTERM)
 
 
-def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:
+def end_with_parent(clean: Callable[[], None] | None = None) -> None:
     """End this process when the one that started it is gone, however it went: nobody waits for its results.
 
     It does the remaining work of the parent (`clean`), and ends its main thread first (SIGTERM), so that it
@@ -175,7 +324,8 @@ def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:
 
     def watch() -> None:
         multiprocessing.connection.wait([parent.sentinel])
-        clean()
+        if clean is not None:
+            clean()
         if hasattr(signal, "pthread_kill"):
             signal.pthread_kill(main, signal.SIGTERM)
             time.sleep(_GRACE_S)

@@ -7,17 +7,12 @@ nobody an answer, unless the next one breaks by the same image.
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import queue
 import shutil
-import signal
 import threading
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,9 +20,11 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.running.processes import end_with_parent, without_interrupts
+from roadgeo.errors import RoadgeoError
+from roadgeo.running.pool import Died, Ended, Lost, Pool
+from roadgeo.running.processes import Processes, tell
 
-__all__ = ["Answer", "Asked", "Full", "Workers"]
+__all__ = ["Answer", "Asked", "Full", "Serving", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,12 +32,14 @@ _LOG = logging.getLogger(__name__)
 _GRACE_S = 15.0
 #: The same where progress is reported, and the client may cancel: a busy machine is no fault.
 _PATIENT_S = 90.0
-#: Time to open its references.
-_START_S = 120.0
-#: Interval of checks whether the client still waits.
-_GLANCE_S = 0.25
-#: Processes that are given an image, one after another, as long as they break.
-_TRIES = 2
+
+#: The status of what is lost, and the sentence about it.
+_LOST = {
+    "died": (500, "it broke two processes, one after another; send another image"),
+    "late": (503, "it took {} and was ended; reduce the image, or come again when less is asked"),
+    "called off": (410, "it was called off"),
+    "no worker": (503, "{}; come again"),
+}
 
 
 class Full(HTTPException):
@@ -92,10 +91,6 @@ class Answer:
     lacks_view: bool = False
 
 
-class CalledOff(Exception):  # noqa: N818 (a wish, not a fault)
-    """Nobody waits for an answer any more."""
-
-
 class Workers:
     """Processes, each with its references open, and a network for photographs that is loaded.
 
@@ -106,24 +101,25 @@ class Workers:
     """
 
     def __init__(self, references: Sequence[str], count: int, waiting: int, threads: int = 1) -> None:
-        """Start them; `waiting` more requests than there are processes may wait, and the network has `threads`."""
-        context = multiprocessing.get_context("spawn")
+        """Start them; `waiting` more requests than there are processes may wait, and the network has `threads`.
+
+        Raises
+        ------
+        RoadgeoError
+            A reference cannot be opened.
+        """
         self._temporary = TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True)
         self.folder = Path(self._temporary.name)
-        given = (list(references), threads, self.folder)
-        self._idle: queue.Queue[_Worker] = queue.Queue()
+        clean = partial(shutil.rmtree, self.folder, ignore_errors=True)
+        self._processes = Processes(Serving(tuple(references), threads), count, grace_s=0.0, clean=clean)
+        self._pool = Pool[Asked, Answer](self._processes, again_alone=False)
         self._places = threading.Semaphore(count + waiting)
-        self._all: list[_Worker] = []
-        self._lock = threading.Lock()
-        self._closed = False
         try:
-            for _ in range(count):
-                self._all.append(_Worker(context, given))
-            for worker in self._all:
-                worker.wait_until_ready()
-                self._idle.put(worker)
-        except BaseException:
+            self._processes.wait_until_ready()
+        except BaseException as error:
             self.close()
+            if isinstance(error, Died | Ended):
+                raise RoadgeoError("a process of the server ended while it opened the references") from error
             raise
 
     def take_place(self) -> ExitStack:
@@ -150,166 +146,49 @@ class Workers:
         called_off : Event, optional
             Once it is set nobody waits for the answer any more.
         """
-        worker = self._idle.get()
+        patience_s = asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S)
         try:
-            return self._ask(worker, asked, say, called_off or threading.Event())
-        finally:
-            self._idle.put(worker)
-
-    def _ask(self, worker: _Worker, asked: Asked, say: Say, called_off: threading.Event) -> Answer:
-        """Ask a process; where it breaks start it anew and ask again, for it may have broken while it was idle."""
-        try:
-            for _ in range(_TRIES):
-                if called_off.is_set():
-                    break
-                try:
-                    return worker.ask(asked, say, called_off)
-                except CalledOff:
-                    self._restart(worker, "nobody waits for its answer any more")
-                except TimeoutError as error:
-                    self._restart(worker, f"it took {error}")
-                    detail = f"it took {error} and was ended; reduce the image, or come again when less is asked"
-                    return Answer(503, {"detail": detail})
-                except (EOFError, OSError) as error:
-                    self._restart(worker, f"it broke ({type(error).__name__})")
-        except OSError as error:
-            return Answer(503, {"detail": f"no process can be started: {error.strerror or error}; come again"})
-        if called_off.is_set():
-            return Answer(410, {"detail": "it was called off"})
-        return Answer(500, {"detail": f"it broke {_TRIES} processes, one after another; send another image"})
-
-    def _restart(self, worker: _Worker, why: str) -> None:
-        with self._lock:
-            if self._closed:
-                raise OSError("the server is ending")
-            _LOG.warning("a process of the server is started anew: %s", why)
-            worker.end()
-            worker.start()
+            answer = self._pool.do(asked, patience_s, say, called_off)
+        except RoadgeoError as error:  # a process that was started anew cannot open the references any more
+            return Answer(503, {"detail": str(error)})
+        if not isinstance(answer, Lost):
+            return answer
+        _LOG.warning("no answer: %s", answer.said)
+        status, sentence = _LOST[answer.why]
+        return Answer(status, {"detail": sentence.format(answer.said)})
 
     def close(self) -> None:
         """End all processes."""
-        with self._lock:
-            self._closed = True
-            for worker in self._all:
-                worker.end()
+        self._processes.close()
         self._temporary.cleanup()
-
-
-class _Worker:
-    """One process, and the pipe to it."""
-
-    def __init__(self, context: Any, given: tuple[list[str], int, Path]) -> None:
-        self._context, self._given = context, given
-        self.start()
-
-    def start(self) -> None:
-        """Start the process.
-
-        Raises
-        ------
-        OSError
-            The system has no room for it.
-        """
-        self._opened: Answer | None = None
-        self._pipe, theirs = self._context.Pipe()
-        try:
-            process = self._context.Process(target=_serve, args=(theirs, *self._given), daemon=True)
-            with without_interrupts():
-                process.start()
-        finally:
-            theirs.close()
-        self._process = process
-
-    def wait_until_ready(self) -> None:
-        """Wait for its references to be open.
-
-        Raises
-        ------
-        IndexFormatError
-            One cannot be opened.
-        """
-        from roadgeo.errors import IndexFormatError
-
-        try:
-            self._opened = self._hear(_START_S)
-        except (EOFError, OSError):
-            self._opened = Answer(503, {"detail": "a process of the server ended while it opened the references"})
-        if self._opened.status != 200:
-            raise IndexFormatError(self._opened.document["detail"])
-
-    def ask(self, asked: Asked, say: Say, called_off: threading.Event) -> Answer:
-        """Return its answer; of a fresh process whose references cannot be opened, the reason.
-
-        Raises
-        ------
-        TimeoutError
-            It takes too long.
-        CalledOff
-            Nobody waits any more.
-        EOFError, OSError
-            The process has ended.
-        """
-        self._opened = self._opened or self._hear(_START_S)
-        if self._opened.status != 200:
-            return self._opened
-        self._pipe.send(asked)
-        return self._hear(asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S), say, called_off)
-
-    def _hear(self, patience_s: float, say: Say = say_nothing, called_off: threading.Event | None = None) -> Answer:
-        """Wait for an answer, the first of which is whether the references are open, and pass the progress on."""
-        until = time.monotonic() + patience_s
-        while time.monotonic() < until:
-            if called_off is not None and called_off.is_set():
-                raise CalledOff
-            if self._pipe.poll(min(_GLANCE_S, patience_s)):
-                message = self._pipe.recv()
-                if isinstance(message, Answer):
-                    return message
-                say(*message)
-        raise TimeoutError(f"longer than {patience_s:g} s")
-
-    def end(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.join(5.0)
-        self._pipe.close()
 
 
 # --- in the process ---------------------------------------------------------------------------------------------------
 
 
-def _serve(pipe: Connection, names: list[str], threads: int, folder: Path) -> None:
-    """Answer until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent(partial(shutil.rmtree, folder, ignore_errors=True))
-    import cv2
+@dataclass(frozen=True)
+class Serving:
+    """The work of a process."""
 
-    from roadgeo.errors import ModelError, RoadgeoError
-    from roadgeo.kernels.warmup import warm_up
-    from roadgeo.running.batch import open_references
-    from roadgeo.running.photographs import load_model
+    references: tuple[str, ...]
+    threads: int
 
-    cv2.setNumThreads(1)
-    try:
-        references = open_references(names)
+    def prepare(self) -> Callable[[Asked], Answer]:
+        """Open the references, and load the network."""
+        from roadgeo.errors import ModelError
+        from roadgeo.kernels.warmup import warm_up
+        from roadgeo.running.batch import open_references
+        from roadgeo.running.photographs import load_model
+
+        references = open_references(self.references)
         warm_up()
         with suppress(ModelError):  # masks are located without it
-            load_model("", None, threads)
-    except RoadgeoError as error:
-        pipe.send(Answer(503, {"detail": str(error)}))
-        return
-    pipe.send(Answer(200, {}))
-    try:
-        while True:
-            asked: Asked = pipe.recv()
-            say = partial(_tell, pipe) if asked.keeps else say_nothing
-            pipe.send(_answer(asked, references, say, threads))
-    except (EOFError, OSError):
-        return
+            load_model("", None, self.threads)
+        return lambda asked: _answer(asked, references, tell if asked.keeps else say_nothing, self.threads)
 
-
-def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
-    pipe.send((text, share))
+    def give_up(self, _: Asked, reason: str) -> Answer:
+        """Make the answer to what is lost."""
+        return Answer(500, {"detail": reason})
 
 
 def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Answer:

@@ -3,7 +3,6 @@
 import json
 import shutil
 import time
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +15,7 @@ from worlds.fenway import write_vector
 from worlds.scenes import PLANE, random_lines
 
 from roadgeo.cli import main
+from roadgeo.errors import RoadgeoError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
@@ -24,6 +24,7 @@ from roadgeo.matching.scene import read_query
 pytest.importorskip("distributed")
 from roadgeo.running import divided
 from roadgeo.running.divided import owners
+from roadgeo.running.pool import Lost
 
 PARTS = [f"0/{n}" for n in range(300)]
 
@@ -127,31 +128,39 @@ def test_it_needs_a_cluster_and_the_usual_search(more, capsys):
 
 
 class Slow:
-    """Stands for a cluster whose only worker is busy with other masks for a while before each task."""
+    """Stands for a pool whose only worker is busy with other masks for a while before each task."""
 
     def __init__(self):
         self.limits = []
 
-    def nthreads(self):
-        return {"tcp://one": 1}
-
-    def submit(self, do, made, query, parts, options, against, **_):
+    def do(self, asked):
         time.sleep(0.3)
-        self.limits.append(options.search.time_limit_s)
-        future = Future()
-        future.set_result(divided._Answer(Location("q", "not_located", "nothing"), [], parts))
-        return future
+        self.limits.append(asked.options.search.time_limit_s)
+        return divided._Answer(Location("q", "not_located", "nothing"), [], asked.names)
+
+
+def locate_on(pool, time_limit_s):
+    options = LocateOptions()
+    options = replace(options, search=replace(options.search, time_limit_s=time_limit_s))
+    mask = np.zeros((64, 64), bool)
+    mask[30:34] = mask[:, 30:34] = True
+    traced_s = read_query(RoadMask(mask)).seconds.vectorize
+    found = divided._locate(
+        pool, lambda: ["tcp://one"], {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options
+    )
+    return found, traced_s
 
 
 def test_waiting_for_a_worker_is_no_time_of_the_search():
-    client, options = Slow(), LocateOptions()
-    options = replace(options, search=replace(options.search, time_limit_s=0.5))
-    mask = np.zeros((64, 64), bool)
-    mask[30:34] = mask[:, 30:34] = True
-    query = read_query(RoadMask(mask))
-    traced_s = query.seconds.vectorize
-    found = divided._locate(client, None, {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options)
+    pool = Slow()
+    found, traced_s = locate_on(pool, 0.5)
     assert found.status == "not_located"
-    assert len(client.limits) == 2
-    assert client.limits[0] > 0.5 - 2.0 * traced_s - 0.1
-    assert client.limits[1] == client.limits[0]
+    assert len(pool.limits) == 2
+    assert pool.limits[0] > 0.5 - 2.0 * traced_s - 0.1
+    assert pool.limits[1] == pool.limits[0]
+
+
+def test_without_a_part_of_the_map_there_is_no_answer():
+    pool = SimpleNamespace(do=lambda _: Lost("died", "the workers died"))
+    with pytest.raises(RoadgeoError, match="a part of the map has no answer: the workers died"):
+        locate_on(pool, 0.5)

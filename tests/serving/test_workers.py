@@ -14,7 +14,6 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.running.looks import Sighting
-from roadgeo.serving.workers import Asked, Workers, _answer, _serve
+from roadgeo.running.pool import Died
+from roadgeo.serving.workers import Asked, Serving, Workers, _answer
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
             answer = workers.ask(Asked(str(tmp_path / name), {}, 5.0, 64_000_000))
             assert answer.status == status, (name, answer)
             assert str(tmp_path) not in answer.document["detail"]
-        first = workers._all[0]._process
+        first = workers._processes._all[0].process
         first.kill()
         first.join()
         answer = workers.ask(Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
@@ -69,27 +69,7 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         workers.close()
 
 
-def answers(pipe, questions):
-    """What a process says to questions until nobody asks any more; the first says whether it is ready."""
-    said = [pipe.recv()]
-    for asked in questions:
-        pipe.send(asked)
-        said.append(pipe.recv())
-    pipe.close()
-    return said
-
-
-def serve(references, questions, monkeypatch, tmp_path):
-    """Do what a process does, in this one."""
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    ours, its = multiprocessing.Pipe()
-    with ThreadPoolExecutor(1) as pool:
-        said = pool.submit(answers, ours, questions)
-        _serve(its, references, 1, tmp_path)
-        return said.result()
-
-
-def test_what_a_process_answers(place, tmp_path, monkeypatch):
+def test_what_a_process_answers(place, tmp_path):
     folder, _ = place
     (tmp_path / "cut.png").write_bytes((folder / "mask.png").read_bytes()[:400])
     (tmp_path / "bomb.png").write_bytes(png(60_000, 60_000))
@@ -101,8 +81,7 @@ def test_what_a_process_answers(place, tmp_path, monkeypatch):
         Asked(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
         Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
     ]
-    ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch, tmp_path)
-    assert ready.status == 200
+    found, elsewhere, small, bomb, cut = map(Serving((str(folder / "town.gpkg"),), 1).prepare(), asked)
     assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
     assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
     assert (small.status, small.document["detail"][:15]) == (413, "900 x 900 pixel")
@@ -112,22 +91,15 @@ def test_what_a_process_answers(place, tmp_path, monkeypatch):
     assert str(tmp_path) not in cut.document["detail"]
 
 
-def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatch):
+def test_a_fault_is_answered_and_not_where_files_lie(place, monkeypatch):
     def fail(path, *_, **__):
         raise ZeroDivisionError(f"in {path}")
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
     folder, _ = place
-    asked = [Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)]
-    _, answer = serve([str(folder / "town.gpkg")], asked, monkeypatch, tmp_path)
+    answer = _answer(Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000), [open_reference(folder / "town.gpkg")])
     assert answer.status == 500
     assert answer.document == {"detail": "a fault of roadgeo: ZeroDivisionError: in the image"}
-
-
-def test_a_process_that_cannot_open_its_references_says_so(tmp_path, monkeypatch):
-    (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch, tmp_path)
-    assert said.status == 503
-    assert "nonesuch.gpkg" in said.document["detail"]
 
 
 def test_a_port_that_is_taken_is_said(place, capsys):
@@ -152,7 +124,7 @@ def one_worker(place):
 def asked_beside(workers, asked):
     """Ask a process that stands still: a list that holds the answer after the block."""
     answers = []
-    os.kill(workers._all[0]._process.pid, signal.SIGSTOP)
+    os.kill(workers._processes._all[0].process.pid, signal.SIGSTOP)
     thread = threading.Thread(target=lambda: answers.append(workers.ask(asked)))
     thread.start()
     yield answers
@@ -163,17 +135,17 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
     workers, asked = one_worker
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
-        workers._all[0]._process.kill()
+        workers._processes._all[0].process.kill()
     assert [answer.status for answer in answers] == [200]
 
 
 def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
     def broken(self, *_):
-        raise EOFError
+        raise Died
 
     workers, asked = one_worker
     with monkeypatch.context() as patch:
-        patch.setattr("roadgeo.serving.workers._Worker.ask", broken)
+        patch.setattr("roadgeo.running.processes._Process.ask", broken)
         assert workers.ask(asked).status == 500
     assert workers.ask(asked).status == 200
 
@@ -194,7 +166,7 @@ def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
     workers, asked = one_worker
-    workers._all[0]._process.kill()
+    workers._processes._all[0].process.kill()
     with monkeypatch.context() as patch:
         patch.setattr("multiprocessing.process.BaseProcess.start", none)
         assert [workers.ask(asked).status for _ in range(2)] == [503, 503]
@@ -203,11 +175,12 @@ def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch
 
 def test_who_asks_while_the_server_ends_is_told(one_worker):
     workers, asked = one_worker
+    process = workers._processes._all[0].process
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
         workers.close()
     assert [answer.status for answer in answers] == [503]
-    assert not workers._all[0]._process.is_alive()
+    assert not process.is_alive()
 
 
 def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):

@@ -1,0 +1,146 @@
+"""The pool, on workers that are threads of the test, and on processes."""
+
+import os
+import threading
+import time
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+
+from roadgeo.errors import RoadgeoError
+from roadgeo.running.pool import Died, Lost, Pool
+from roadgeo.running.processes import Processes, tell
+
+GIVE_UP = SimpleNamespace(give_up=lambda task, reason: f"{task}: {reason}")
+
+
+@dataclass
+class Toys:
+    """Workers that answer with the task; `deaths` says how often they die of which."""
+
+    count: int = 2
+    deaths: dict[int, int] = field(default_factory=dict)
+    died: str = "they died"
+    slow: int = -1
+    begun: list[int] = field(default_factory=list)
+    beside: dict[int, int] = field(default_factory=dict)
+    inside: int = 0
+    goes_on: threading.Event = field(default_factory=threading.Event)
+
+    def busy(self) -> int:
+        return self.count
+
+    def ask(self, task, *_):
+        self.begun.append(task)
+        self.inside += 1
+        self.beside[task] = self.inside
+        try:
+            if task == self.slow:
+                self.goes_on.wait(10)
+            time.sleep(0.002)
+            if self.deaths.get(task, 0):
+                self.deaths[task] -= 1
+                raise Died
+            return task
+        finally:
+            self.inside -= 1
+
+    def close(self) -> None:
+        self.goes_on.set()
+
+
+def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
+    toys = Toys(4, {3: 1, 7: 2})
+    found = list(Pool(toys).run(range(20), GIVE_UP))
+    assert [result for k, result in enumerate(found) if k != 7] == [k for k in range(20) if k != 7]
+    assert found[7] == "7: they died"
+    assert (toys.begun.count(3), toys.begun.count(7)) == (2, 2)
+    assert (toys.beside[3], toys.beside[7]) == (1, 1)
+
+
+def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
+    toys = Toys(2, slow=0)
+    results = Pool(toys).run(range(200), GIVE_UP)
+    reader = threading.Timer(0.5, toys.goes_on.set)
+    reader.start()
+    assert next(results) == 0
+    assert 20 < len(toys.begun) <= 33
+    assert list(results) == list(range(1, 200))
+
+
+def test_what_a_task_raises_is_raised_and_ends_the_workers() -> None:
+    toys = Toys()
+    toys.ask = lambda *_: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        list(Pool(toys).run(range(3), GIVE_UP))
+    assert toys.goes_on.is_set()
+
+
+@dataclass(frozen=True)
+class Tasks:
+    """Says its process, waits, tells how far it is, or fails, as it is told."""
+
+    prepares: bool = True
+
+    def prepare(self):
+        if not self.prepares:
+            raise RoadgeoError("no map")
+        return self.do
+
+    def do(self, task: str) -> object:
+        if task == "wait":
+            time.sleep(60)
+        if task == "tell":
+            tell("half", 0.5)
+        if task == "fail":
+            raise RoadgeoError("no road")
+        if task == "odd":
+            raise _OddError("one", two=2)
+        return os.getpid()
+
+
+class _OddError(Exception):
+    """Cannot be sent to another process."""
+
+    def __init__(self, one: str, *, two: int) -> None:
+        super().__init__(one, two)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    processes = Processes(Tasks(), 1, grace_s=0.0)
+    yield Pool(processes)
+    processes.close()
+
+
+def test_progress_is_passed_on_and_errors_are_raised(pool: Pool) -> None:
+    told: list[object] = []
+    process = pool.do("tell", say=lambda *said: told.append(said))
+    assert told == [("half", 0.5)]
+    with pytest.raises(RoadgeoError, match="no road"):
+        pool.do("fail")
+    with pytest.raises(RuntimeError, match="_OddError"):
+        pool.do("odd")
+    assert pool.do("") == process
+
+
+def test_what_takes_too_long_or_is_called_off_is_ended(pool: Pool) -> None:
+    before = pool.do("")
+    assert pool.do("wait", 0.2) == Lost("late", "longer than 0.2 s")
+    assert pool.do("") != before
+    called_off = threading.Event()
+    threading.Timer(0.3, called_off.set).start()
+    assert pool.do("wait", called_off=called_off).why == "called off"
+    before = pool.do("")
+    assert pool.do("wait", called_off=called_off).why == "called off"
+    assert pool.do("") == before  # nobody had begun
+
+
+def test_processes_that_cannot_prepare_say_why() -> None:
+    processes = Processes(Tasks(prepares=False), 1, grace_s=0.0)
+    for _ in range(2):
+        with pytest.raises(RoadgeoError, match="no map"):
+            Pool(processes).do("")
+    processes.close()
+    assert Pool(processes).do("").why == "no worker"
