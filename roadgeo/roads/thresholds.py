@@ -18,7 +18,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import width_by_area
 
 __all__ = [
-    *("Sample", "are_labels", "are_roads", "find_thresholds", "find_unlabelled", "ground_and_road"),
+    *("Sample", "are_labels", "are_patches", "are_roads", "find_numbered", "find_thresholds", "find_unlabelled"),
+    "ground_and_road",
     *("refuse_different_bands", "spread_probability"),
 ]
 
@@ -40,6 +41,9 @@ _MAX_DEPTH = 2.3  # ninth decile of the depth of light pixels, of its mean: 1.8 
 
 #: Neighbours in a faint map differ by one level, in a map of classes by any number of them.
 _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
+_ALIKE = 0.9  # share of neighbours of one number, in a mask of numbered roads
+#: Share of neighbours that differ in a photograph, and their usual difference, of the span.
+_RESTLESS, _SMOOTH = 0.3, 0.15
 _MANY_LEVELS = 8  # more classes than this do not look like roads
 
 _BINS = 256  # of a histogram that a threshold is found by
@@ -102,7 +106,7 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
         raise MaskError(
             f"{sample.name}: {len(levels)} values from {low:g} to {high:g}, too alike to part; give a threshold"
         )
-    if sample.seen.dtype.kind in "iu" and high <= _MAX_CLASS:
+    if sample.seen.dtype.kind in "iu" and high <= _MAX_CLASS and not _is_dark_photograph(sample, levels):
         _refuse_classes(sample, levels)
         return _spread(values, _otsu(values))
     _refuse_colours(sample, levels)
@@ -156,6 +160,24 @@ def are_labels(values: AnyArray) -> bool:
     return len(levels) == 3 and levels[:2].tolist() == [0, 1] and bool(levels[2] > _MAX_CLASS)
 
 
+def find_numbered(sample: Sample) -> float | None:
+    """Return the threshold of a mask whose roads have numbers, such as instances, lanes, speeds or years; else None."""
+    levels = sample.levels
+    is_plain = len(levels) > 2 and levels[0] == 0 and not np.any(levels != np.round(levels)) and not are_labels(levels)
+    if not is_plain or (sample.seen.shape[1] > 1 and np.ptp(sample.seen, axis=1).any()):
+        return None
+    rows = sample.read_rows()
+    return float(levels[1]) / 2 if are_patches(rows, rows > 0) and are_roads(rows > 0) else None
+
+
+def are_patches(values: AnyArray, shown: BoolArray) -> bool:
+    """Whether neighbours among the (rows, columns) shown mostly have one value, of several whole ones."""
+    pairs = shown[:, 1:] & shown[:, :-1], shown[1:] & shown[:-1]
+    same = (values[:, 1:] == values[:, :-1])[pairs[0]], (values[1:] == values[:-1])[pairs[1]]
+    equal = np.concatenate(same)
+    return bool(len(equal) and equal.mean() > _ALIKE and not np.any(values[shown] % 1))
+
+
 def ground_and_road(sample: Sample, threshold: float) -> tuple[float, float]:
     """Return the usual values below and above a threshold that parts them."""
     return _medians(sample.seen[:, sample.channel].astype(np.float64), threshold)
@@ -198,6 +220,16 @@ def _refuse_classes(sample: Sample, levels: AnyArray) -> None:
     listed = ", ".join(f"{level:g}" for level in levels)
     what = f"{sample.name}: holds the classes {listed}; expected road and no road"
     raise MaskError(f"{what}: give the one that is road with --class N, or a threshold")
+
+
+def _is_dark_photograph(sample: Sample, levels: AnyArray) -> bool:
+    """Whether small whole numbers change all over the frame, and by little from pixel to pixel, as no classes do."""
+    rows = sample.read_rows().astype(np.float64)
+    steps = np.abs(np.diff(rows, axis=1))
+    changes = steps[steps > 0]
+    is_filled = len(levels) >= _MANY_LEVELS and len(levels) >= _MIN_LEVELS_FILLED * (levels[-1] - levels[0] + 1)
+    is_smooth = len(changes) > 0 and np.median(changes) <= max(_SMOOTH * (levels[-1] - levels[0]), 1.0)
+    return bool(is_filled and is_smooth and len(changes) > _RESTLESS * steps.size)
 
 
 def _refuse_colours(sample: Sample, levels: AnyArray) -> None:

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.thresholds import (
     Sample,
+    are_patches,
     are_roads,
+    find_numbered,
     find_thresholds,
     find_unlabelled,
     ground_and_road,
@@ -40,6 +43,7 @@ _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are inte
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _MAX_ROAD_SHARE = 0.35  # of a frame
 _MOST_LISTED = 8
+_MANY_VALUES = 9  # beside a fill that no file declares
 
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
@@ -159,6 +163,7 @@ def open_mask(
         _require_mask(raster)
         if choice.road_class is not None:
             raster = _of_class(raster, choice.road_class)
+        raster = _without_fill(raster)
         seen, hidden = _sample(raster)
         if len(hidden):
             raster = _drawn(raster, seen, hidden)
@@ -172,6 +177,10 @@ def open_mask(
         refuse_different_bands(sample)
         if threshold is None:
             raster, sample = _without_unlabelled(raster, sample)
+        number = find_numbered(sample) if threshold is None else None
+        if number is not None:
+            _LOG.warning("%s: holds a number for each of its roads: all above 0 is road", visible(raster.name))
+        threshold = threshold if number is None else number
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
         levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
         yield MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, seen, channel, choice))
@@ -189,7 +198,8 @@ def _part_of(raster: Raster, seen: AnyArray, channel: int, choice: Choice) -> st
 def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
     """Take what shows roads by being there, or by not being there, for roads.
 
-    The first are opaque pixels of one dark colour: black roads on transparent ground. The second are nodata, masked or
+    The first are opaque pixels of one dark colour: black roads on transparent ground; or pixels of one value, or of one
+    for each road, that look like roads where all others are nodata. The second are nodata, masked or
     transparent pixels that look like roads on ground of one value, or in a soft map with values below theirs. (n, B)
     values of a sample were observed, or not.
     """
@@ -198,6 +208,10 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
         return replace(_where(raster, True), bands=raster.bands[:1])
     middle, valid = _middle(raster)
     shown = ~_finite(middle, valid)
+    is_one = len(seen) > 0 and ((seen == seen[0]).all() or are_patches(middle[..., 0], ~shown))
+    if 0 < share <= _MAX_ROAD_SHARE and is_one and are_roads(~shown):
+        _LOG.warning("%s: all that is observed looks like roads: it is taken for them", visible(raster.name))
+        return replace(_where(raster, True), bands=raster.bands[:1])
     edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
     if not 1 - _MAX_ROAD_SHARE <= share < 1 or max(edge.mean() for edge in edges) > 0.5 or not are_roads(shown):
         return raster
@@ -236,6 +250,26 @@ def _of_class(raster: Raster, number: int) -> Raster:
         listed = ", ".join(f"{value:g}" for value in classes[:_MOST_LISTED])
         raise MaskError(f"{raster.name}: holds no value {number}, but {listed}; give the one that is road with --class")
     return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
+
+
+def _without_fill(raster: Raster) -> Raster:
+    """Leave out pixels of a value that lies far from all others, and does not look like roads: nodata by no name."""
+    seen, _ = _sample(raster)
+    for end in () if len(seen) == 0 else (seen.min(), seen.max()):
+        is_fill = (seen == end).all(axis=1)
+        others = seen[~is_fill].astype(np.float64)
+        if not is_fill.any() or len(np.unique(others)) < _MANY_VALUES:
+            continue
+        apart = max(others.min() - float(end), float(end) - others.max())
+        if apart > np.ptp(others) and not are_roads((_middle(raster)[0] == end).all(axis=2)):
+            _LOG.warning("%s: its value %g, far from all others, is taken for not observed", visible(raster.name), end)
+            return _changed(raster, partial(_known_but, end))
+    return raster
+
+
+def _known_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:
+    known = (values != fill).any(axis=2)
+    return values, known if valid is None else known & valid
 
 
 def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]:

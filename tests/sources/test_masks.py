@@ -662,3 +662,91 @@ def test_an_ignored_border_of_roads_is_no_road(tmp_path: Path, roads: np.ndarray
     labels = np.where(roads, 1, np.where(wide, 255, 0)).astype(np.uint8)
     found = read_mask(write_raster(tmp_path / "a.tif", labels[None], nodata=255), voids=False)
     np.testing.assert_array_equal(found.roads, roads)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "int16"])
+def test_a_dark_photograph_is_no_map_of_classes(kind: str) -> None:
+    dark = (
+        (cv2.GaussianBlur(np.random.default_rng(0).random((200, 240)), (0, 0), 1.5) * 150 - 60).clip(0, 30).astype(kind)
+    )
+    with pytest.raises(PhotographError):
+        read_mask(dark)
+
+
+@pytest.mark.parametrize(("kind", "fill"), [("uint16", 65535), ("int16", -9999), ("float32", -9999.0)])
+def test_a_fill_in_a_photograph_is_no_road(kind: str, fill: float, caplog: pytest.LogCaptureFixture) -> None:
+    picture = (200 + 2000 * np.random.default_rng(0).random((200, 240))).astype(kind)
+    picture[np.add.outer(np.arange(200), np.arange(240)) < 150] = fill
+    with pytest.raises(PhotographError):
+        read_mask(picture)
+    assert "is taken for not observed" in caplog.text
+
+
+@pytest.mark.parametrize(("kind", "fill"), [("float32", -9999.0), ("int16", -32768), ("uint8", 255)])
+def test_a_fill_in_a_soft_map_is_not_observed(roads: np.ndarray, kind: str, fill: float) -> None:
+    soft = np.rint(100 * cv2.GaussianBlur(roads.astype(np.float32), (0, 0), 1.0)).astype(kind)
+    soft[:, :20] = fill
+    found = read_mask(soft, voids=False)
+    assert found.observed is not None
+    assert not found.observed[:, :20].any()
+    assert found.observed[:, 20:].all()
+    assert np.mean(found.roads[:, 20:] != roads[:, 20:]) < 0.05
+
+
+def numbered(roads: np.ndarray, kind: str) -> np.ndarray:
+    """Give each road a number."""
+    bands = np.indices(SHAPE).sum(axis=0) // 12  # pieces along the roads
+    numbers = {
+        "instances": 1 + bands,
+        "many": 40 + 11 * bands,
+        "lanes": 1 + bands % 3,
+        "speeds": np.array([30, 50, 90])[bands % 3],
+        "years": 1990 + bands,
+        "float years": 1990.0 + bands,
+    }[kind]
+    types = {"years": "uint16", "float years": "float32"}
+    return (roads * numbers).astype(types.get(kind, "uint8"))
+
+
+NUMBERED = ["instances", "many", "lanes", "speeds", "years", "float years"]
+
+
+@pytest.mark.parametrize("container", ["array", "tif", "png", "nodata", "masked", "rgb"])
+@pytest.mark.parametrize("kind", NUMBERED)
+def test_numbers_above_0_are_road(
+    roads: np.ndarray, kind: str, container: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = numbered(roads, kind)
+    if container == "png" and kind == "float years":
+        pytest.skip("no such PNG")
+    path = tmp_path / "a.png"
+    if container == "png":
+        cv2.imwrite(str(path), values)
+    source = {
+        "array": lambda: values,
+        "masked": lambda: np.ma.masked_equal(values, 0),
+        "rgb": lambda: np.dstack([values] * 3),
+        "png": lambda: path,
+        "tif": lambda: write_raster(tmp_path / "a.tif", values),
+        "nodata": lambda: write_raster(tmp_path / "a.tif", values, nodata=0),
+    }[container]()
+    found = read_mask(source, voids=False)
+    np.testing.assert_array_equal(found.roads, roads)
+    assert "road" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["nodata", "nan", "masked", "minus infinity", "alpha"])
+@pytest.mark.parametrize("value", [0, 1, 7])
+def test_what_alone_is_observed_is_road(roads: np.ndarray, kind: str, value: int, tmp_path: Path) -> None:
+    values = np.where(roads, value, 255).astype(np.uint8)
+    path = tmp_path / "a.png"
+    if kind == "alpha":
+        cv2.imwrite(str(path), np.dstack([np.full(SHAPE, value, np.uint8)] * 3 + [roads * np.uint8(255)]))
+    source = {
+        "nodata": lambda: write_raster(tmp_path / "a.tif", values, nodata=255),
+        "nan": lambda: np.where(roads, float(value), np.nan),
+        "minus infinity": lambda: np.where(roads, float(value), -np.inf),
+        "masked": lambda: np.ma.masked_array(values, ~roads),
+        "alpha": lambda: path,
+    }[kind]()
+    np.testing.assert_array_equal(read_mask(source, voids=False).roads, roads)

@@ -28,6 +28,11 @@ _SAMPLE_SIDE = 1024  # deep values are stretched by the range of a sample of thi
 #: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.
 _WHITE, _BLACK = 250, 3
 _DARKEST, _LIGHTEST = 8, 245  # of stretched values
+_FEW_VALUES = (
+    64  # 8-bit values that span less, but for half a hundredth at either end, are stretched: night, haze, a flat scan
+)
+_SHOWN_SHARE = 0.1  # of a frame that is not filled, at least
+_FILLED_SHARE = 0.01  # of the frame that has the least or the greatest value, at least, where it is a fill
 _VOID_CORE_PX, _VOID_AREA_PX, _VOID_EDGE_PX = 15, 20_000, 9
 
 
@@ -121,17 +126,23 @@ def _require_bands(dataset: DatasetReader, name: str, bands: Sequence[int]) -> l
 
 
 def _read(
-    dataset: DatasetReader, bands: list[int], part: tuple[float, float, float, float], shape: tuple[int, int]
+    dataset: DatasetReader,
+    bands: list[int],
+    part: tuple[float, float, float, float],
+    shape: tuple[int, int],
+    nearest: bool = False,
 ) -> tuple[AnyArray, BoolArray]:
-    """Read a part as (H, W, B) values and (H, W) validity; averaged where it is reduced."""
+    """Read a part as (H, W, B) values and (H, W) validity; averaged where it is reduced, or `nearest` values."""
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
     window = Window(*part)
     reduced = part[3] > shape[0]
-    resampling = Resampling.average if reduced else Resampling.bilinear
+    resampling = Resampling.nearest if nearest else Resampling.average if reduced else Resampling.bilinear
     values = dataset.read(bands, window=window, out_shape=(len(bands), *shape), resampling=resampling)
     valid = dataset.dataset_mask(window=window, out_shape=shape) > 0
+    if values.dtype.kind == "f":
+        valid &= np.isfinite(values).all(axis=0)
     return np.moveaxis(values, 0, 2), valid
 
 
@@ -141,22 +152,37 @@ def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callab
     if palette is not None:
         table = palette
         return lambda values: table[values[..., 0]]
-    if dataset.dtypes[bands[0] - 1] == "uint8":
-        return _as_rgb
+    kind = dataset.dtypes[bands[0] - 1]
     scale = max(dataset.shape) / _SAMPLE_SIDE
-    shape = tuple(max(1, round(side / max(scale, 1))) for side in dataset.shape)
-    sample, valid = _read(dataset, bands, (0, 0, dataset.width, dataset.height), (shape[0], shape[1]))
-    seen = sample[valid & np.isfinite(sample.astype(np.float64)).all(axis=2)].astype(np.float64)
-    if len(seen) == 0:
+    shape = max(1, round(dataset.height / max(scale, 1))), max(1, round(dataset.width / max(scale, 1)))
+    whole = (0, 0, dataset.width, dataset.height)
+    (sample, valid), (exact, _) = (_read(dataset, bands, whole, shape, nearest) for nearest in (False, True))
+    if not valid.any():
         raise MaskError(f"{name}: holds no observed pixel; give a photograph that shows ground")
+    fills = _find_fills(exact[valid])
+    shown = valid & ~np.isin(exact, fills).all(axis=2)
+    if shown.sum() < _SHOWN_SHARE * valid.sum():
+        fills, shown = [], valid
+    seen = sample[shown].astype(np.float64)
     low, high = np.percentile(seen, [1, 99])
+    if kind == "uint8" and not 0 < np.ptp(np.percentile(seen, [0.5, 99.5])) < _FEW_VALUES:
+        return _as_rgb
 
     def stretch(values: AnyArray) -> AnyArray:
         scaled = (np.nan_to_num(values.astype(np.float32)) - low) / max(high - low, 1e-9)
         # Neither black nor white, which would mean that there is no photograph.
-        return _as_rgb(np.clip(_DARKEST + (_LIGHTEST - _DARKEST) * scaled, _DARKEST, _LIGHTEST).astype(np.uint8))
+        found = np.clip(_DARKEST + (_LIGHTEST - _DARKEST) * scaled, _DARKEST, _LIGHTEST).astype(np.uint8)
+        for fill in fills:
+            found[(values == fill).all(axis=2)] = 255 if fill > high else 0
+        return _as_rgb(found)
 
     return stretch
+
+
+def _find_fills(seen: AnyArray) -> list[float]:
+    """Return the least and the greatest of (n, B) values where many pixels have it in all bands: a fill, maybe."""
+    ends = (float(seen.min()), float(seen.max()))
+    return [end for end in ends if (seen == end).all(axis=1).mean() > _FILLED_SHARE]
 
 
 def _as_rgb(values: AnyArray) -> AnyArray:

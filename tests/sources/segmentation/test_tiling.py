@@ -16,7 +16,7 @@ from roadgeo.roads.thresholds import spread_probability
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
-from roadgeo.sources.segmentation.photograph import open_photograph
+from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, mean_of
 from roadgeo.sources.segmentation.tiling import _look, segment
 
@@ -266,3 +266,35 @@ def test_more_ways_average_what_is_seen(network, photo: Path) -> None:
     with open_photograph(photo) as opened:  # a model of single pixels sees the same each way
         item, many = segment(opened, network), segment(opened, network, ways=4)
     np.testing.assert_array_equal(item.mask(0.5).roads, many.mask(0.5).roads)
+
+
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [("uint8", 0, 30), ("uint8", 100, 130), ("uint8", 220, 250), ("uint16", 0, 255), ("float32", 0.0, 0.1)],
+)
+def test_few_values_are_stretched(tmp_path: Path, kind: str, low: float, high: float) -> None:
+    """At night, in haze, of a flat scan."""
+    grey = np.random.default_rng(0).random((120, 150))
+    path = write_raster(
+        tmp_path / "a.tif", (low + (high - low) * grey).round(3 if kind == "float32" else 0).astype(kind)
+    )
+    with open_photograph(path) as opened:
+        rgb, _ = opened.read(0.0, 0.0, 150.0, 120.0, (120, 150))
+        assert find_ground(opened, (120, 150)).all()
+    assert np.percentile(rgb, 5) < 35
+    assert np.percentile(rgb, 95) > 215
+
+
+@pytest.mark.parametrize(
+    ("kind", "fill"),
+    [("uint16", 0), ("uint16", 65535), ("int16", -9999), ("float32", -9999.0), ("float32", np.nan), ("uint8", 0)],
+)
+def test_a_fill_that_no_file_declares_is_no_ground(tmp_path: Path, kind: str, fill: float) -> None:
+    values = (60 + 150 * np.random.default_rng(0).random((300, 400))).astype(kind)
+    values[:, :120] = fill
+    with open_photograph(write_raster(tmp_path / "a.tif", values)) as opened:
+        rgb, _ = opened.read(0.0, 0.0, 400.0, 300.0, (300, 400))
+        ground = find_ground(opened, (300, 400))
+    assert not ground[:, :115].any()
+    assert ground[:, 130:].all()
+    assert np.ptp(rgb[:, 130:]) > 130
