@@ -19,7 +19,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 
-__all__ = ["Died", "Ended", "Lost", "Pool", "Work", "Workers"]
+__all__ = ["Died", "Ended", "Lost", "Pool", "Ready", "Work", "Workers"]
 
 Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
@@ -30,11 +30,15 @@ ResultOut = TypeVar("ResultOut", covariant=True)
 _UNREAD = 16
 
 
-class Work(Protocol[TaskIn, ResultOut]):
-    """The work done for each task; it travels to other processes, so it can be pickled."""
+class Ready(Protocol[TaskIn, ResultOut]):
+    """Makes workers ready; it travels to other processes, so it can be pickled."""
 
     def prepare(self) -> Callable[[TaskIn], ResultOut]:
         """Make a process ready (open the references) and return the function that does one task."""
+
+
+class Work(Ready[TaskIn, ResultOut], Protocol[TaskIn, ResultOut]):
+    """The work done for each of many tasks."""
 
     def give_up(self, task: TaskIn, reason: str) -> ResultOut:
         """Make the result of a task that is lost."""

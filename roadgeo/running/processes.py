@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any, NoReturn, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Died, Ended, Pool, Work
+from roadgeo.running.pool import Died, Ended, Pool, Ready, Work
 from roadgeo.storage.files import remove_own
 
 __all__ = ["Processes", "end_with_parent", "run", "tell", "without_interrupts"]
@@ -74,7 +75,12 @@ class Processes:
     died = "the process that worked on it died (out of memory?)"
 
     def __init__(
-        self, work: Work[Any, Any], count: int, *, grace_s: float = _GRACE_S, clean: Callable[[], None] | None = None
+        self,
+        work: Ready[Any, Any],
+        count: int,
+        *,
+        grace_s: float = _GRACE_S,
+        clean: Callable[[], None] | None = None,
     ) -> None:
         """Start them.
 
@@ -87,9 +93,9 @@ class Processes:
         """
         self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
         self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-        self._all = [_Process(work, clean) for _ in range(count)]
+        self.all = [_Process((work, clean)) for _ in range(count)]
         try:
-            for process in self._all:
+            for process in self.all:
                 process.start()
                 self._idle.put(process)
         except BaseException:
@@ -98,43 +104,29 @@ class Processes:
 
     def busy(self) -> int:
         """Return how many tasks keep them busy: each has one, and the next one waits."""
-        return 2 * len(self._all)
+        return 2 * len(self.all)
 
     def wait_until_ready(self) -> None:
-        """Wait until all have prepared; raises what the first raised that could not.
-
-        Raises
-        ------
-        Died, Ended
-            One died meanwhile, or took too long.
-        """
-        for process in self._all:
-            process.become_ready()
+        """Wait until all have prepared; raises what the first raised that could not, or as `ask` does."""
+        for process in self.all:
+            process.ask(None, 0.0, say_nothing, threading.Event())
 
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Have the next one that is free do a task. One that fails at that is started anew."""
+        """Have the next one that is free do a task. One that has no result for it is started anew."""
         process = self._idle.get()
         try:
             if called_off.is_set():
                 raise Ended("called off", "it was called off")
             self._start(process)
-            done, result = self._ask(process, task, patience_s, say, called_off)
-        finally:
-            self._idle.put(process)
-        if not done:
-            raise result
-        return result
-
-    def _ask(self, process: _Process, *asked: Any) -> tuple[bool, Any]:
-        try:
-            process.become_ready()
-            return process.ask(*asked)
-        except BaseException as error:
-            process.end(0.0)
-            if isinstance(error, Died | Ended):
+            try:
+                return process.ask(task, patience_s, say, called_off)
+            except (Died, Ended):
+                process.end(0.0)
                 with contextlib.suppress(Ended):
                     self._start(process)
-            raise
+                raise
+        finally:
+            self._idle.put(process)
 
     def _start(self, process: _Process) -> None:
         """Start a process that has ended, unless all are to end."""
@@ -150,20 +142,19 @@ class Processes:
         """End all."""
         with self._lock:
             self._closed = True
-            for process in self._all:
+            for process in self.all:
                 process.tell_to_end()
             until = time.monotonic() + self._grace_s
-            for process in self._all:
+            for process in self.all:
                 process.end(until - time.monotonic())
 
 
+@dataclass
 class _Process:
     """One process, and the pipe to it."""
 
-    def __init__(self, *given: Any) -> None:
-        self._given = given
-        self.process: Any = None
-        self._is_ready = False
+    given: tuple[Any, ...]
+    process: Any = None
 
     def start(self) -> None:
         """Start it where it is not.
@@ -180,58 +171,40 @@ class _Process:
         context: Any = multiprocessing.get_context(method)
         if method == "forkserver":
             context.set_forkserver_preload(_PRELOAD)
-        ours, theirs = context.Pipe()
-        try:
-            process = context.Process(target=_serve, args=(theirs, *self._given), daemon=True)
+        self._pipe, theirs = context.Pipe()
+        with theirs:
+            process = context.Process(target=_serve, args=(theirs, *self.given), daemon=True)
             with without_interrupts():
                 process.start()
-        finally:
-            theirs.close()
-        self._pipe, self.process, self._is_ready = ours, process, False
+        self.process, self._start_s = process, _START_S
 
-    def become_ready(self) -> None:
-        """Wait until it has prepared; raises what that raises.
+    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+        """Return the result of a task, or raise what it raised; the first one waits until the process has prepared.
 
         Raises
         ------
         Died, Ended
-            It died meanwhile, or takes too long.
+            There is none.
         """
-        if not self._is_ready:
-            self._is_ready, error = self._hear(_START_S, say_nothing, threading.Event())
-            if error is not None:
-                raise error
-
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> tuple[bool, Any]:
-        """Return whether a task is done, and its result or error.
-
-        Raises
-        ------
-        Died, Ended
-            There is neither.
-        """
-        try:
-            self._pipe.send(task)
-        except OSError as error:
-            raise Died from error
-        return self._hear(patience_s, say, called_off)
-
-    def _hear(self, patience_s: float, say: Say, called_off: threading.Event) -> tuple[bool, Any]:
-        """Wait for an answer, and pass the progress on."""
-        until = time.monotonic() + patience_s
-        while (left := until - time.monotonic()) > 0.0:
-            if called_off.is_set():
-                raise Ended("called off", "it was called off")
+        patience_s += self._start_s
+        kind, until, said = "", time.monotonic() + patience_s, list[Any]()
+        while kind not in ("done", "failed"):
+            left = until - time.monotonic()
+            if called_off.is_set() or left <= 0.0:
+                late = Ended("late", f"longer than {patience_s:g} s")
+                raise Ended("called off", "it was called off") if called_off.is_set() else late
             try:
-                message: Any = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else None
+                if not kind:
+                    self._pipe.send(task)
+                kind, *said = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else ("waiting",)
             except (EOFError, OSError) as error:
                 raise Died from error
-            if isinstance(message, _Said):
-                say(*message)
-            elif message is not None:
-                done, result = message
-                return bool(done), result
-        raise Ended("late", f"longer than {patience_s:g} s")
+            if kind == "told":
+                say(said[0], said[1])
+        self._start_s = 0.0
+        if kind == "failed":
+            raise said[0]
+        return said[0]
 
     def tell_to_end(self) -> None:
         """Tell it to end."""
@@ -249,23 +222,16 @@ class _Process:
 
 # --- in the process ---------------------------------------------------------------------------------------------------
 
-
-class _Said(tuple[Any, ...]):
-    """Progress: a text, and a share or None."""
-
-    __slots__ = ()
-
-
 _parents: list[Connection] = []
 
 
 def tell(text: str, share: float | None = None) -> None:
     """Tell whoever waits for the task that this process does how far it is."""
     for pipe in _parents:
-        pipe.send(_Said((text, share)))
+        pipe.send(("told", text, share))
 
 
-def _serve(pipe: Connection, work: Work[Any, Any], clean: Callable[[], None] | None) -> None:
+def _serve(pipe: Connection, work: Ready[Any, Any], clean: Callable[[], None] | None) -> None:
     """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
@@ -275,35 +241,23 @@ def _serve(pipe: Connection, work: Work[Any, Any], clean: Callable[[], None] | N
 
         cv2.setNumThreads(1)  # the processes share the processors already
         _parents[:] = [pipe]
-        do: Callable[[Any], Any] | None = None
-        try:
-            do = work.prepare()
-        except Exception as error:
-            pipe.send((False, _portable(error)))
-            return
-        pipe.send((True, None))
+        kind, do = _reply(work.prepare)
         with contextlib.suppress(EOFError, OSError):
             while True:
-                pipe.send(_attempt(do, pipe.recv()))
+                task = pipe.recv()
+                pipe.send((kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task))
     except SystemExit:  # the task has cleaned up
         _leave()
 
 
-def _attempt(do: Callable[[Any], Any], task: Any) -> tuple[bool, Any]:
-    """Return whether a task is done, and its result or error."""
+def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
+    """Return what is done, or the error as it can be sent."""
     try:
-        return True, do(task)
+        return "done", do(*task)
     except Exception as error:
-        return False, _portable(error)
-
-
-def _portable(error: Exception) -> Exception:
-    """Return an error as it can be sent."""
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 (from ourselves)
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
+        with contextlib.suppress(Exception):
+            return "failed", pickle.loads(pickle.dumps(error))  # noqa: S301 (from ourselves)
+        return "failed", RuntimeError(f"{type(error).__name__}: {error}")
 
 
 def _leave() -> NoReturn:

@@ -186,10 +186,6 @@ class Serving:
             load_model("", None, self.threads)
         return lambda asked: _answer(asked, references, tell if asked.keeps else say_nothing, self.threads)
 
-    def give_up(self, _: Asked, reason: str) -> Answer:
-        """Make the answer to what is lost."""
-        return Answer(500, {"detail": reason})
-
 
 def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Answer:
     """Do what is asked; the one place where what goes wrong with an image is caught."""

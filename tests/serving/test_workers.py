@@ -57,7 +57,7 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
             answer = workers.ask(Asked(str(tmp_path / name), {}, 5.0, 64_000_000))
             assert answer.status == status, (name, answer)
             assert str(tmp_path) not in answer.document["detail"]
-        first = workers._processes._all[0].process
+        first = workers._processes.all[0].process
         first.kill()
         first.join()
         answer = workers.ask(Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
@@ -124,7 +124,7 @@ def one_worker(place):
 def asked_beside(workers, asked):
     """Ask a process that stands still: a list that holds the answer after the block."""
     answers = []
-    os.kill(workers._processes._all[0].process.pid, signal.SIGSTOP)
+    os.kill(workers._processes.all[0].process.pid, signal.SIGSTOP)
     thread = threading.Thread(target=lambda: answers.append(workers.ask(asked)))
     thread.start()
     yield answers
@@ -135,7 +135,7 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
     workers, asked = one_worker
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
-        workers._processes._all[0].process.kill()
+        workers._processes.all[0].process.kill()
     assert [answer.status for answer in answers] == [200]
 
 
@@ -166,7 +166,7 @@ def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
     workers, asked = one_worker
-    workers._processes._all[0].process.kill()
+    workers._processes.all[0].process.kill()
     with monkeypatch.context() as patch:
         patch.setattr("multiprocessing.process.BaseProcess.start", none)
         assert [workers.ask(asked).status for _ in range(2)] == [503, 503]
@@ -175,7 +175,7 @@ def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch
 
 def test_who_asks_while_the_server_ends_is_told(one_worker):
     workers, asked = one_worker
-    process = workers._processes._all[0].process
+    process = workers._processes.all[0].process
     with asked_beside(workers, asked) as answers:
         time.sleep(0.2)
         workers.close()
