@@ -5,12 +5,13 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
+from roadgeo.cli.options import Once
 from roadgeo.cli.printing import echo
 
 __all__ = ["completion_command"]
 
 
-@click.command("completion", short_help="Complete commands and options in your shell.")
+@click.command("completion", cls=Once, short_help="Complete commands and options in your shell.")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion_command(shell: str) -> None:
     """Print what makes a SHELL complete roadgeo's commands and options.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import take
+from roadgeo.cli.options import Once, take
 from roadgeo.cli.printing import complain, echo
 from roadgeo.outputs.wording import format_lonlat
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["demo_command"]
 
 
-@click.command("demo", short_help="Locate a photograph and five masks: needs no network and no data.")
+@click.command("demo", cls=Once, short_help="Locate a photograph and five masks: needs no network and no data.")
 @take("out_dir", help="Where everything is written; made if missing.", default="roadgeo_demo", show_default=True)
 def demo_command(out_dir: str) -> int:
     """Show the whole way on real data: build references, locate, write every output, compare with the truth.

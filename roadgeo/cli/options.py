@@ -6,6 +6,7 @@ import inspect
 import os
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -33,6 +34,7 @@ __all__ = [
     "RESULTS",
     "SEARCH",
     "Command",
+    "Once",
     "Plugin",
     "Read",
     "each",
@@ -83,7 +85,27 @@ class _Option(click.Option):
         return names, text
 
 
-class Command(click.Command):
+class Once(click.Command):
+    """A command that takes an option twice only where each time counts."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read its options.
+
+        Raises
+        ------
+        click.UsageError
+            One is given twice, and one of them would be ignored.
+        """
+        if not ctx.resilient_parsing:
+            _, _, given = self.make_parser(ctx).parse_args(list(args))
+            for param, times in Counter(given).items():
+                is_switch = isinstance(param, click.Option) and param.is_flag and not param.secondary_opts
+                if times > 1 and param.nargs == 1 and not (is_switch or getattr(param, "multiple", False)):
+                    raise click.UsageError(f"{max(param.opts, key=len)} is given {times} times: give it once.", ctx)
+        return super().parse_args(ctx, args)
+
+
+class Command(Once):
     """A command whose help lists its options in groups, and leaves what is rarely wanted to --help-all.
 
     --help-all shows besides what stands in the help below a form feed, and `more`, below the options.

@@ -7,7 +7,7 @@ import os
 import click
 
 from roadgeo.cli import Group
-from roadgeo.cli.options import OTHERS, row
+from roadgeo.cli.options import OTHERS, Once, row
 from roadgeo.cli.printing import echo
 
 __all__ = ["qgis_command"]
@@ -25,7 +25,7 @@ def qgis_command() -> None:
     """
 
 
-@qgis_command.command("install", short_help="Put the plugin into a QGIS profile.")
+@qgis_command.command("install", cls=Once, short_help="Put the plugin into a QGIS profile.")
 @row("--profile", "PROFILE", OTHERS,
      "A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
      default="default", show_default=True)  # fmt: skip
@@ -48,7 +48,7 @@ def install_command(profile: str) -> None:
     echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
 
 
-@qgis_command.command("package", short_help="Make the plugin's package.")
+@qgis_command.command("package", cls=Once, short_help="Make the plugin's package.")
 @row("-o --out", "FILE", OTHERS, "The package. Default: roadgeo_qgis-VERSION.zip.", type=click.Path(dir_okay=False))
 @row("--email", "ADDRESS", OTHERS, "The publisher's. Default, here and below: as the package says.")
 @row("--repository", "URL", OTHERS, "Where the source code is.")

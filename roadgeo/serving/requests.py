@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -60,31 +60,30 @@ def read_query_string(text: str) -> dict[str, Any]:
         A name is not known, or a value makes no sense.
     """
     try:
-        return read_hints(dict(parse_qsl(text, True, strict_parsing=bool(text), max_num_fields=20)))
+        return read_hints(parse_qsl(text, True, strict_parsing=bool(text), max_num_fields=20))
     except ValueError as error:
         raise HTTPException(400, f"the query of the URL cannot be read: {error}") from error
 
 
-def read_hints(values: Mapping[str, Any]) -> dict[str, Any]:
+def read_hints(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Check hints, and give them the names that the search has for them.
 
     Raises
     ------
     HTTPException
-        A name is not known, or a value makes no sense.
+        A name is not known or given twice, or a value makes no sense.
     """
     hints: dict[str, Any] = {}
-    for name, value in values.items():
+    for name, value in values:
         if name not in _NAMES and name != _TAKE:
             raise HTTPException(400, f"got {str(name)[:40]!r}, expected one of {', '.join([*_NAMES, _TAKE])}")
         if isinstance(value, str) and len(value) > _MOST_LETTERS:
             raise HTTPException(400, f"{name}: a text of {len(value)} characters, expected at most {_MOST_LETTERS}")
+        goes_to, read = (_TAKE, _read_take) if name == _TAKE else (_NAMES[name].goes_to, _NAMES[name].read)
+        if goes_to in hints:
+            raise HTTPException(400, f"{name} is given twice: give it once")
         try:
-            if name == _TAKE:
-                hints[_TAKE] = _read_take(value)
-                continue
-            hint = _NAMES[name]
-            hints[hint.goes_to] = hint.read(value)
+            hints[goes_to] = read(value)
         except ValueError as error:
             raise HTTPException(400, f"{name}: {error}") from error
     return hints

@@ -136,3 +136,39 @@ def test_what_is_rarely_wanted_is_explained_by_all_of_the_help() -> None:
     whole = " ".join(shown("locate", "--help-all").split())
     assert "share of the map's shards" in whole
     assert "worldfile" in whole
+
+
+@pytest.mark.parametrize(
+    ("typed", "refused"),
+    [
+        ("locate a.png --gsd 0.3 --gsd 0.5", "--gsd is given 2 times: give it once."),
+        ("locate a.png -j 2 --jobs 2", "--jobs is given 2 times: give it once."),
+        ("locate a.png --mirror --no-mirror", "--mirror is given 2 times: give it once."),
+        ("demo -o a --out-dir b", "--out-dir is given 2 times: give it once."),
+        ("simulate porto -o a -o b", "--out-dir is given 2 times: give it once."),
+    ],
+)
+def test_an_option_that_counts_once_is_given_once(typed: str, refused: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(typed.split()) == 2
+    assert refused in capsys.readouterr().err
+
+
+def test_what_may_be_given_more_often_may() -> None:
+    typed = [
+        "a.png",
+        "b.png",
+        "-r",
+        "x",
+        "-r",
+        "y",
+        "--also",
+        "kmz",
+        "--also",
+        "gcps",
+        "-v",
+        "-v",
+        "--report",
+        "--report",
+    ]
+    given = command("locate").make_context("locate", typed).params
+    assert (given["references"], given["products"]) == (("x", "y"), ("kmz", "gcps"))

@@ -55,9 +55,9 @@ def test_other_urls_are_refused(text):
 
 def test_a_flag_is_no_number():
     with pytest.raises(HTTPException):
-        read_hints({"focal": True})
+        read_hints([("focal", True)])
     with pytest.raises(HTTPException):
-        read_hints({"northUp": 1})
+        read_hints([("northUp", 1)])
 
 
 HINTS = st.sampled_from(["near", "gsd", "maxTilt", "focal", "northUp", "timeLimit", "colour"])
@@ -71,7 +71,7 @@ VALUES = st.recursive(
 @settings(max_examples=40)
 def test_any_hints_are_finite_numbers_or_refused(values):
     try:
-        found = read_hints(values)
+        found = read_hints(values.items())
     except HTTPException:
         return
     for value in found.values():
@@ -83,3 +83,9 @@ def test_a_place_to_take_is_a_whole_number_from_1():
     for text in ("take=0", "take=1.5", "take=x", "take=1e9", "take=nan"):
         with pytest.raises(HTTPException, match="take: got"):
             read_query_string(text)
+
+
+def test_a_hint_that_is_given_twice_is_refused():
+    with pytest.raises(HTTPException, match="gsd is given twice") as refused:
+        read_query_string("gsd=0.3&near=1,2,500&gsd=0.5")
+    assert refused.value.status_code == 400
