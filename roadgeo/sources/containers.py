@@ -28,8 +28,8 @@ __all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_
 _PARQUET = (".parquet", ".geoparquet", ".pq")
 _GRAPHS = (".graphml",)
 _GDAL = (
-    ".gpkg", ".shp", ".geojson", ".geojsonl", ".geojsons", ".fgb", ".gml", ".kml", ".gpx", ".sqlite", ".tab", ".mif",
-    ".shz", ".dxf", ".gdb",
+    ".gpkg", ".shp", ".geojson", ".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl", ".topojson", ".fgb",
+    ".gml", ".kml", ".kmz", ".gpx", ".sqlite", ".tab", ".mif", ".shz", ".dxf", ".gdb",
 )  # fmt: skip
 #: Names of road files.
 ENDINGS = OSM_ENDINGS + _PARQUET + _GRAPHS + _GDAL

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -29,6 +31,10 @@ _LOG = logging.getLogger(__name__)
 #: Files that hold lines, not pixels, by their names.
 QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
 
+#: What lies beside road files, or tells of them.
+_BESIDE = re.compile(
+    r"\.(shx|dbf|prj|cpg|sbn|sbx|qpj|qix|qmd|qml|lyrx?|idm|ind|dat|id|map|mid|index|gfs|xsd|aux|xml|txt|md|html?|pdf|log)"
+)
 #: Number of features by which a file of a folder is recognised as roads.
 _LOOK = 20_000
 _WHOLE = 1 << 30
@@ -54,7 +60,12 @@ def list_sources(path: Path) -> list[Path]:
 
 
 def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
-    found = [file for file in files if file.name.lower().endswith(ENDINGS)]
+    found = [file for file in files if file.name.lower().endswith(QUERY_ENDINGS)]
+    others = [file for file in files if file not in found and not file.name.startswith(".")]
+    unread = Counter("folder" if file.is_dir() else file.suffix.lower() or "without a suffix" for file in others)
+    listed = ", ".join(f"{n} {suffix}" for suffix, n in sorted(unread.items()) if not _BESIDE.fullmatch(suffix))
+    if listed:
+        _LOG.warning("%s: passed over: %s: not read from a folder", visible(str(folder)), visible(listed))
     if not found:
         raise RoadSourceError(f"{folder}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
     if len(found) == 1:
@@ -67,7 +78,10 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
             continue
         try:
             tells[file] = file.name.lower().endswith(OSM_ENDINGS) or _tells_kinds(file)
-        except NoRoadsError as error:
+        except RoadSourceError as error:
+            # By its name a .json, or a packed file, may be anything.
+            if not isinstance(error, NoRoadsError) and file.name.lower().endswith(ENDINGS):
+                raise
             why[file] = str(error).removeprefix(f"{file}: ")
     if any(tells.values()):
         why |= {

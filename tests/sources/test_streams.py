@@ -1,5 +1,8 @@
 """Road files are read part by part as they are read whole."""
 
+import gzip
+import json
+
 import numpy as np
 import pytest
 import shapely
@@ -9,7 +12,7 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.projection import transformer
 from roadgeo.sources import osm_files
 from roadgeo.sources.roads import read_roads
-from roadgeo.sources.streams import read_lines, stream_lines
+from roadgeo.sources.streams import list_sources, read_lines, stream_lines
 
 FORMATS = ["streets.gpkg", "streets.shp", "streets.geojson", "streets.parquet", "streets.osm.gz", "streets.osm.pbf"]
 
@@ -87,3 +90,45 @@ def test_several_layers_are_read_together(tmp_path, crs):
     assert shapely.hausdorff_distance(found.lines, np.array(lines)).max() < 1e-7
     assert found.highway.tolist() == highway[:3] + [""] * len(moved)
     assert len(read_lines(path, "local").lines) == len(moved)
+
+
+@pytest.mark.parametrize(
+    "more", ["geojsonl", "ndjson", "topojson", "json", "geojson.gz", "fgb", "parquet", "osm.pbf"]
+)
+@pytest.mark.parametrize("first", ["gpkg", "geojson"])
+def test_a_folder_is_read_whole_or_says_what_it_passes_over(tmp_path, more, first, caplog):
+    folder = tmp_path / "roads"
+    folder.mkdir()
+    lines, highway, _ = streets()
+    write_vector(folder / f"a.{first}", lines[:3], highway=highway[:3])
+    if more == "topojson":
+        arcs = [[list(xy) for xy in line.coords] for line in lines]
+        objects = [
+            {"type": "LineString", "arcs": [k], "properties": {"highway": kind}} for k, kind in enumerate(highway)
+        ]
+        topology = {
+            "type": "Topology",
+            "arcs": arcs,
+            "objects": {"r": {"type": "GeometryCollection", "geometries": objects}},
+        }
+        (folder / "b.topojson").write_text(json.dumps(topology))
+    elif more in ("parquet", "osm.pbf"):
+        write_streets(folder / f"b.{more}")
+    else:
+        name = {"ndjson": "geojsonl", "json": "geojson", "geojson.gz": "geojson"}.get(more, more)
+        written = write_vector(tmp_path / f"b.{name}", lines, highway=highway)
+        content = written.read_bytes()
+        (folder / f"b.{more}").write_bytes(gzip.compress(content) if more.endswith("gz") else content)
+    for name in ("c.dwg", "d.xlsx", "e.osc", "f.mbtiles", "g.geojson.xz", "notes.txt", "a.prj", ".hidden"):
+        (folder / name).write_bytes(b"x")
+    (folder / "older").mkdir()
+    assert len(list_sources(folder)) == 2
+    assert "passed over: 1 .dwg, 1 .mbtiles, 1 .osc, 1 .xlsx, 1 .xz, 1 folder: not read" in caplog.text
+
+
+def test_a_json_that_is_something_else_is_passed_over(tmp_path, caplog):
+    lines, highway, _ = streets()
+    write_vector(tmp_path / "a.gpkg", lines, highway=highway)
+    (tmp_path / "settings.json").write_text('{"colour": "red"}')
+    assert list_sources(tmp_path) == [tmp_path / "a.gpkg"]
+    assert "settings.json: passed over" in caplog.text
