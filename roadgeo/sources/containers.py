@@ -39,8 +39,10 @@ _LAYERS = ("roads", "edges", "lines", "entities", "elements")
 _ONE_DRAWING = (".gpx", ".kml", ".kmz")
 #: Drawings, whose layers GDAL gives as a column of one layer; and its names, in tables made of drawings too.
 _DRAWINGS, _LEVELS = (".dxf", ".dgn", ".dwg"), ("layer", "level", "layername", "layer_name")
-#: Names of columns that hold shapes in a Parquet file without `geo`.
-_SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
+#: Names of columns that hold shapes in a table that declares none, and types of their values.
+_SHAPES, _TEXTS = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt"), ("binary", "string")
+_SRID, _HEX = re.compile(r"\s*SRID\s*=\s*(\d{1,9})\s*;", re.IGNORECASE), re.compile(r"[0-9A-Fa-f]{18,}")
+_INIT = re.compile(r"\{'init': '(epsg:\d{1,9})'.*\}", re.IGNORECASE)  # a CRS as osmnx wrote it before 0.12
 _PEEK = 1000
 #: What services write into an answer that is a part of what was asked for: ArcGIS, WFS, OGC API - Features.
 _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d{1,12})")
@@ -49,8 +51,8 @@ _LIMITED = re.compile(
 )
 _ENDS_BYTES = 1 << 16  # of a file, where it says so
 _EXPECTED = (
-    "expected a path, a GeoDataFrame, a GeoSeries, a graph of osmnx or momepy, shapely lines, "
-    "or arrays of coordinates of shape (N, 2)"
+    "expected a path, a GeoDataFrame, a GeoSeries, a table of pandas, polars or pyarrow with a column of WKB or WKT, "
+    "a graph of osmnx or momepy, shapely lines, or arrays of coordinates of shape (N, 2)"
 )
 
 
@@ -233,7 +235,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
     try:
         _require_rows(path)
         with pq.ParquetFile(path) as file:
-            shape_column, crs, encoding = _geometry_of(file)
+            shape_column, crs, encoding = _geometry_of(file.schema_arrow)
             names = [name for name in file.schema_arrow.names if name != shape_column]
             leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
         wanted = [name for name in names if is_known_column(name)] or names
@@ -244,45 +246,67 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
                 size += sum(map(_unpacked_size, batch.columns))
                 require_bounded(path, size)
                 columns = {name: objects(batch[name].to_pylist()) for name in wanted}
-                yield RoadTable(_shapes(batch, shape_column, encoding), crs, columns, {"format": "Parquet"})
+                shapes, srid = _shapes(batch, shape_column, encoding)
+                yield RoadTable(shapes, crs or srid or None, columns, {"format": "Parquet"})
                 done += len(batch)
                 advance(done / file.metadata.num_rows)
     except (ValueError, TypeError, LookupError, pa.ArrowException, OSError) as error:  # of its text, when looked at
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
 
 
-def _geometry_of(file: Any) -> tuple[str, Any, str]:
-    """Return the geometry column of a Parquet file, its CRS and its encoding."""
-    import pyarrow as pa
+def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> tuple[str, Any, str]:
+    """Return the geometry column of a table of Arrow's or of Parquet, its CRS and its encoding.
 
-    stored = file.schema_arrow.metadata or {}
+    `first` returns a value of a column, by which it is known where no name tells.
+    """
+    stored = schema.metadata or {}
     if b"geo" in stored:
         geo = json.loads(stored[b"geo"])
         column = geo["columns"][geo["primary_column"]]
         return geo["primary_column"], column.get("crs", "EPSG:4326"), str(column.get("encoding"))
-    schema = file.schema_arrow
-    for name in sorted(schema.names, key=lambda name: (name.lower() not in _SHAPES, name)):
-        kind = schema.field(name).type
-        kind = getattr(kind, "storage_type", kind)
-        if name.lower() in _SHAPES and (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
-            return name, None, "WKB"
-        if name.lower() in _SHAPES and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-            return name, None, "WKT"
-    raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
+    for field in schema:
+        told = field.metadata or {}
+        named = told.get(b"ARROW:extension:name", b"").decode() or getattr(field.type, "extension_name", "")
+        if named.startswith(("geoarrow.", "ogc.")):
+            return field.name, json.loads(told.get(b"ARROW:extension:metadata") or "{}").get("crs"), named.split(".")[1]
+    texts = [field.name for field in schema if str(field.type).removeprefix("large_").removesuffix("_view") in _TEXTS]
+    found = next((name for name in texts if name.lower() in _SHAPES), None) or next(
+        (name for name in texts if _is_shape(first(name))), None
+    )
+    if found is None:
+        raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
+    return found, None, "WKB"
 
 
-def _shapes(batch: Any, column: str, encoding: str) -> AnyArray:
-    import geopandas as gpd
-    import pyarrow as pa
+def _is_shape(value: Any) -> bool:
+    """Whether a value is WKB or WKT."""
+    return isinstance(value, bytes | bytearray | memoryview | str) and _read_shapes([value])[0][0] is not None
+
+
+def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
+    """Return shapes of WKB, also in hexadecimal digits, or WKT, of PostGIS too, and the number of their CRS, or 0."""
     import shapely
 
-    if encoding.upper() == "WKB":
-        return np.asarray(shapely.from_wkb(batch[column].to_pylist(), on_invalid="ignore"))
-    if encoding == "WKT":
-        return np.asarray(shapely.from_wkt(batch[column].to_pylist(), on_invalid="ignore"))
+    known = next((value for value in values if value is not None), b"")
+    if isinstance(known, str) and not _HEX.fullmatch(known[:64]):
+        srid = _SRID.match(known)
+        texts = [value and _SRID.sub("", value) for value in values]
+        return np.asarray(shapely.from_wkt(texts, on_invalid="ignore")), int(srid[1]) if srid else 0
+    packed = [bytes(value) if isinstance(value, bytearray | memoryview) else value for value in values]
+    shapes = np.asarray(shapely.from_wkb(packed, on_invalid="ignore"))
+    return shapes, max(0, *shapely.get_srid(shapes).tolist()) if len(shapes) else 0
+
+
+def _shapes(batch: Any, column: str, encoding: str) -> tuple[AnyArray, int]:
+    """Return the shapes of a table of Arrow's, and the number of their CRS, or 0."""
+    import geopandas as gpd
+    import pyarrow as pa
+
+    if encoding.upper() in ("WKB", "WKT"):
+        return _read_shapes(batch[column].to_pylist())
     named = pa.field(column, batch.schema.field(column).type, metadata={"ARROW:extension:name": f"geoarrow.{encoding}"})
     table = pa.Table.from_arrays([batch[column]], schema=pa.schema([named]))
-    return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy())
+    return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy()), 0
 
 
 def _unpacked_size(column: Any) -> int:
@@ -318,18 +342,17 @@ def _read_graphml(path: Path) -> RoadTable:
     import xml.etree.ElementTree as ET
 
     import networkx as nx
-    import osmnx as ox
 
     refuse_named_files(path)
     try:
-        table = _graph_table(ox.load_graphml(path))
+        table = _graph_table(nx.read_graphml(path))
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
     return RoadTable(table.shapes, table.crs, table.columns, {"format": "GraphML", "attribution": OSM_ATTRIBUTION})
 
 
 def held_table(roads: Any) -> RoadTable:
-    """Return a program's object as a table: a GeoDataFrame or GeoSeries, a graph, shapely lines, arrays.
+    """Return a program's object as a table: of geopandas, pandas or Arrow, a graph, shapely lines, arrays.
 
     Raises
     ------
@@ -340,29 +363,64 @@ def held_table(roads: Any) -> RoadTable:
 
     if hasattr(roads, "edges") and hasattr(roads, "graph"):  # networkx
         return _graph_table(roads)
-    if hasattr(roads, "columns") and (table := _held_columns(roads)) is not None:
-        return table
+    if hasattr(roads, "__arrow_c_stream__") and not hasattr(roads, "iloc"):  # polars, pyarrow, DuckDB ...
+        return _arrow_table(roads)
+    if hasattr(roads, "columns") and hasattr(roads, "iloc"):  # pandas
+        return _held_columns(roads)
     try:
         is_single = isinstance(roads, shapely.Geometry) or (isinstance(roads, np.ndarray) and roads.ndim == 2)
         listed = [roads] if is_single else list(roads)
         shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
     except (TypeError, ValueError) as error:
-        raise RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {error}; {_EXPECTED}") from error
+        raise _unreadable(roads, str(error)) from error
     return RoadTable(objects(shapes), getattr(roads, "crs", None))
 
 
-def _held_columns(roads: Any) -> RoadTable | None:
-    """Return a table of geopandas, or of pandas with a column of shapes, as `pd.merge` gives it; None without one."""
+def _arrow_table(roads: Any) -> RoadTable:
+    """Return what any library hands over as Arrow does."""
+    import pyarrow as pa
+
+    try:
+        table = pa.table(roads)
+        column, crs, encoding = _geometry_of(table.schema, lambda name: _first(table[name].to_pylist()))
+        shapes, srid = _shapes(table, column, encoding)
+        if len(shapes) and not any(shapes):
+            raise ValueError(f"its column {column!r} holds neither WKB nor WKT")
+    except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
+        raise _unreadable(roads, first_line(error)) from error
+    columns = {name: objects(table[name].to_pylist()) for name in table.column_names if name != column}
+    return RoadTable(shapes, crs or srid or None, columns)
+
+
+def _held_columns(roads: Any) -> RoadTable:
+    """Return a table of geopandas, or of pandas with a column of shapes, as `pd.merge` gives it, or of WKB or WKT."""
     import shapely
 
     columns = {str(name): roads[name].to_numpy(object) for name in roads.columns}
     held = [name for name, values in columns.items() if shapely.is_geometry(values).any()]
     active = getattr(getattr(roads, "geometry", None), "name", None)
-    name = active if active in held or not len(roads) else next(iter(held), None)
+    name = active if active in held or (active and not len(roads)) else next(iter(held), None)
+    if name is not None:
+        shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
+        return RoadTable(shapes, getattr(roads, "crs", None), columns)
+    name = next((name for name, values in columns.items() if _is_shape(_first(values))), None)
     if name is None:
-        return None
-    shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
-    return RoadTable(shapes, getattr(roads, "crs", None), columns)
+        raise _unreadable(roads, "none of its columns holds shapes")
+    values = [None if value is None or value != value else value for value in columns.pop(name)]
+    try:
+        shapes, srid = _read_shapes(values)
+    except TypeError as error:
+        raise _unreadable(roads, f"column {name!r} holds more than shapes") from error
+    return RoadTable(shapes, srid or None, columns)
+
+
+def _first(values: Sequence[Any]) -> Any:
+    """Return the first value that is one."""
+    return next((value for value in values if value is not None and value == value), None)
+
+
+def _unreadable(roads: Any, why: str) -> RoadSourceError:
+    return RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {why}; {_EXPECTED}")
 
 
 def _line(coordinates: Any) -> Any:
@@ -397,7 +455,9 @@ def _graph_table(graph: Any) -> RoadTable:
             shape = shapely.LineString(ends)
         shapes.append(shape)
         rows.append(data)
-    return RoadTable(objects(shapes), graph.graph.get("crs"), _columns(rows))
+    crs = graph.graph.get("crs")
+    old = _INIT.fullmatch(crs) if isinstance(crs, str) else None
+    return RoadTable(objects(shapes), old[1] if old else crs, _columns(rows))
 
 
 def _columns(rows: Sequence[Mapping[Any, Any]]) -> dict[str, AnyArray]:

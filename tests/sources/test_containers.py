@@ -1,11 +1,14 @@
 """Roads that a program holds: graphs of several libraries, series, shapes."""
 
 import logging
+from pathlib import Path
 
 import geopandas as gpd
 import networkx as nx
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import shapely
 from worlds.fenway import streets
@@ -95,7 +98,6 @@ def test_a_series_says_that_it_tells_no_kinds(caplog):
 @pytest.mark.parametrize("which", ["highway", "geometry"])
 def test_a_value_that_is_stored_once_counts_as_often_as_it_is_read(which, nested, tmp_path):
     """A file of 2 kB took 8 GB."""
-    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     long = {"highway": b"x" * 1_000_000, "geometry": shapely.LineString(np.zeros((60_000, 2))).wkb}[which]
     short = {"highway": b"primary", "geometry": shapely.LineString([(0, 0), (1, 1)]).wkb}
     columns = {name: pa.array([value] * 100, pa.binary()) for name, value in {**short, which: long}.items()}
@@ -125,6 +127,80 @@ def test_a_table_with_shapes_needs_a_crs(name: str) -> None:
     assert len(choose_roads(table, crs=4326)) == len(right) - 1
 
 
-def test_a_table_without_shapes_is_refused() -> None:
-    with pytest.raises(RoadSourceError, match="roads of type DataFrame cannot be read"):
-        choose_roads(pd.DataFrame({"highway": streets()[1], "geometry": shapely.to_wkt(streets()[0])}), crs=4326)
+@pytest.mark.parametrize(
+    "columns",
+    [{"highway": ["residential"]}, {"geometry": ["Main Street"]}, {"geometry": [b"x"]}, {"geometry": [3.0]}, {}],
+)
+@pytest.mark.parametrize("library", ["pandas", "pyarrow", "stream"])
+def test_a_table_without_shapes_is_refused(columns: dict[str, list[object]], library: str) -> None:
+    with pytest.raises(RoadSourceError, match=r"roads of type \w+ cannot be read: .*expected a path, a GeoDataFrame"):
+        choose_roads(TABLES[library](columns), crs=4326)
+
+
+class Streamed:
+    """Stands for a table of any library that hands it over as Arrow does."""
+
+    def __init__(self, columns: dict[str, list[object]]) -> None:
+        self.table = pa.table(columns)
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        return self.table.__arrow_c_stream__(requested_schema)
+
+
+def polars(columns: dict[str, list[object]]) -> object:
+    return pytest.importorskip("polars").DataFrame(columns)
+
+
+TABLES = {"pandas": pd.DataFrame, "pyarrow": pa.table, "stream": Streamed, "polars": polars}
+SHAPES = {
+    "WKB": shapely.to_wkb,
+    "hexadecimal": lambda shapes: shapely.to_wkb(shapes, hex=True),
+    "of PostGIS": lambda shapes: shapely.to_wkb(shapely.set_srid(shapes, 4326), hex=True, include_srid=True),
+    "WKT": lambda shapes: shapely.to_wkt(shapes, rounding_precision=-1),
+    "WKT of PostGIS": lambda shapes: ["SRID=4326;" + text for text in shapely.to_wkt(shapes, rounding_precision=-1)],
+}
+
+
+@pytest.mark.parametrize("name", ["geometry", "wkb_geometry", "shape_of_it"])
+@pytest.mark.parametrize("shapes", SHAPES)
+@pytest.mark.parametrize("library", [*TABLES, "parquet"])
+def test_tables_of_any_library_give_the_same_roads(tmp_path: Path, library: str, shapes: str, name: str) -> None:
+    lines, highway, tunnel = streets()
+    packed = [None, *SHAPES[shapes](np.array(lines))]
+    columns = {"highway": [None, *highway], "tunnel": [None, *tunnel], name: packed}
+    crs = None if "PostGIS" in shapes else 4326
+    if library == "parquet":
+        if name == "shape_of_it":
+            pytest.skip("by its name")
+        pq.write_table(pa.table(columns), tmp_path / "roads.parquet")
+        found = choose_roads(tmp_path / "roads.parquet", crs=crs)
+    else:
+        found = choose_roads(TABLES[library](columns), crs=crs)
+    right = choose_roads(gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs=CRS))
+    assert shapely.hausdorff_distance(found.lines, right.lines).max() < 1e-6
+    assert found.kinds.tolist() == right.kinds.tolist()
+
+
+@pytest.mark.parametrize("encoding", ["WKB", "geoarrow"])
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32619"])
+def test_a_table_of_geopandas_that_arrow_holds_keeps_its_crs(encoding: str, crs: str) -> None:
+    table = gpd.GeoDataFrame({"highway": streets()[1]}, geometry=streets()[0], crs=CRS).to_crs(crs)
+    found = choose_roads(pa.table(table.to_arrow(geometry_encoding=encoding)))
+    right = choose_roads(table)
+    assert shapely.hausdorff_distance(found.lines, right.lines).max() < 1e-6
+    assert found.plane == right.plane
+
+
+@pytest.mark.parametrize("crs", ["{'init': 'epsg:4326'}", "{'init': 'epsg:4326', 'no_defs': True}", "epsg:4326"])
+def test_graphml_of_any_osmnx(tmp_path: Path, crs: str) -> None:
+    """Of 2017: the CRS as a dictionary's text, numbers and truths as text, lists as text."""
+    graph = nx.MultiDiGraph(crs=crs, name="Fenway", created_with="OSMnx 0.8.2")
+    for n, line in enumerate(streets()[0]):
+        for end, (x, y) in ((0, line.coords[0]), (1, line.coords[-1])):
+            graph.add_node(f"{n}{end}", x=str(x), y=str(y), osmid=f"{n}{end}")
+        kind = f"['{streets()[1][n]}', 'unclassified']"
+        graph.add_edge(f"{n}0", f"{n}1", geometry=line.wkt, highway=kind, oneway="None", length="12.5", osmid="[1, 2]")
+    nx.write_graphml(graph, tmp_path / "a.graphml")
+    found = choose_roads(tmp_path / "a.graphml")
+    assert len(found) == len(streets()[0])
+    assert found.kinds[0] == f"{streets()[1][0]};unclassified"

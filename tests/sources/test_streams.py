@@ -92,9 +92,7 @@ def test_several_layers_are_read_together(tmp_path, crs):
     assert len(read_lines(path, "local").lines) == len(moved)
 
 
-@pytest.mark.parametrize(
-    "more", ["geojsonl", "ndjson", "topojson", "json", "geojson.gz", "fgb", "parquet", "osm.pbf"]
-)
+@pytest.mark.parametrize("more", ["geojsonl", "ndjson", "topojson", "json", "geojson.gz", "fgb", "parquet", "osm.pbf"])
 @pytest.mark.parametrize("first", ["gpkg", "geojson"])
 def test_a_folder_is_read_whole_or_says_what_it_passes_over(tmp_path, more, first, caplog):
     folder = tmp_path / "roads"
