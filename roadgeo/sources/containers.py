@@ -49,6 +49,9 @@ _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d
 _LIMITED = re.compile(
     rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^>]*\bnext\s*=\s*[\"']\w"
 )
+#: Formats of a feature a line; and the name of an XML file's outermost element, behind what may come before it.
+_BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
+_ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*(?:<[?!].*?>\s*)*<([\w:.-]+)"), 1 << 12
 _ENDS_BYTES = 1 << 16  # of a file, where it says so
 _EXPECTED = (
     "expected a path, a GeoDataFrame, a GeoSeries, a table of pandas, polars or pyarrow with a column of WKB or WKT, "
@@ -112,6 +115,7 @@ def _stream_gdal(
 ) -> Iterator[RoadTable]:
     import shapely
 
+    _require_whole(path)
     parts = _choose_parts(path, [layer] if isinstance(layer, str) else [*(layer or ())], areas=areas)
     for n, (held, column, levels) in enumerate(parts):
         total, columns, hint = _choose_columns(path, held)
@@ -121,6 +125,10 @@ def _stream_gdal(
             found = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
             if found.shapes is None:
                 raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
+            if len(found.shapes) < min(most, total - skip):
+                raise RoadSourceError(
+                    f"{path}: is cut off: {skip + len(found.shapes):,} of {total:,} features are in it"
+                )
             shapes, table = shapely.from_wkb(found.shapes, on_invalid="ignore"), dict(found.columns)
             if column:
                 named = table[column.lower()] if column in columns else table.pop(column.lower())
@@ -202,6 +210,25 @@ def _listed(names: Sequence[str]) -> str:
     """Join names for a message, at most eight."""
     shown = ", ".join(names[:8])
     return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+def _require_whole(path: Path) -> None:
+    """Refuse a file that ends too early, of a format of which GDAL would read the rest."""
+    if not path.is_file():
+        return
+    ending, size = path.suffix.lower(), path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+        file.seek(max(size - _HEAD_BYTES, 0))
+        last = file.read().rstrip()
+    root = _ROOT.match(head) if ending in (".gml", ".gpx", ".kml") else None
+    is_cut = (
+        (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
+        or (ending in _BY_LINES and not last.endswith(b"}"))
+        or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
+    )
+    if is_cut:
+        raise RoadSourceError(f"{path}: is cut off after {size:,} bytes; copy or export it again")
 
 
 def what_is_missing(path: Path, n_features: int) -> str:
@@ -384,10 +411,10 @@ def _arrow_table(roads: Any) -> RoadTable:
         table = pa.table(roads)
         column, crs, encoding = _geometry_of(table.schema, lambda name: _first(table[name].to_pylist()))
         shapes, srid = _shapes(table, column, encoding)
-        if len(shapes) and not any(shapes):
-            raise ValueError(f"its column {column!r} holds neither WKB nor WKT")
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
         raise _unreadable(roads, first_line(error)) from error
+    if len(shapes) and not any(shapes):
+        raise _unreadable(roads, f"its column {column!r} holds neither WKB nor WKT")
     columns = {name: objects(table[name].to_pylist()) for name in table.column_names if name != column}
     return RoadTable(shapes, crs or srid or None, columns)
 

@@ -3,6 +3,7 @@
 import gzip
 import json
 
+import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
@@ -130,3 +131,24 @@ def test_a_json_that_is_something_else_is_passed_over(tmp_path, caplog):
     (tmp_path / "settings.json").write_text('{"colour": "red"}')
     assert list_sources(tmp_path) == [tmp_path / "a.gpkg"]
     assert "settings.json: passed over" in caplog.text
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.999])
+@pytest.mark.parametrize(
+    "name",
+    ["a.shp", "a.geojsonl", "a.ndjson", "a.geojson", "a.gpkg", "a.fgb", "a.gml", "a.kml", "a.parquet", "a.osm.pbf"],
+)
+def test_a_file_that_is_cut_off_is_refused(tmp_path, name, share):
+    lines, highway, _ = streets()
+    path = tmp_path / name
+    if name in ("a.parquet", "a.osm.pbf"):
+        write_streets(path)
+    else:
+        table = gpd.GeoDataFrame({"highway": highway}, geometry=lines, crs=4326)
+        drivers = {"ndjson": "GeoJSONSeq", "geojsonl": "GeoJSONSeq", "gml": "GML", "kml": "KML", "fgb": "FlatGeobuf"}
+        table.to_file(path, engine="pyogrio", driver=drivers.get(path.suffix[1:]))
+    assert len(read_lines(path).lines) > 3
+    whole = path.read_bytes()
+    path.write_bytes(whole[: min(int(share * len(whole)), len(whole) - 2)])
+    with pytest.raises(RoadSourceError, match=r"cut off|damaged|not readable"):
+        read_lines(path)
