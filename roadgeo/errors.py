@@ -59,6 +59,8 @@ class Reason(StrEnum):
     FEW_NEAR = "few_near"
     #: Stopped before everything was tried.
     TIME_LIMIT = "time_limit"
+    #: The roads fit better at a place that the hints exclude.
+    FITS_ELSEWHERE = "fits_elsewhere"
     #: No place explains clearly more than others do.
     NOTHING_STANDS_OUT = "nothing_stands_out"
     #: Something did, but not by enough for all the looks that were taken.

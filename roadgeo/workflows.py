@@ -18,6 +18,7 @@ from roadgeo.matching.methods import Searched, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
+from roadgeo.matching.veto import contest
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, open_whole
 from roadgeo.roads.network import build_network
 
@@ -123,4 +124,6 @@ def _search(
     query = read_query(mask)
     left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
     parts = [part for one in references for part in one.parts]
-    return query, search_references(query, parts, options, left, explained), options
+    searched = search_references(query, parts, options, left, explained)
+    spent_s = sum(one.match_s + one.refine_s for one in searched)
+    return query, contest(query, searched, parts, options, max(left - spent_s, 0.0)), options

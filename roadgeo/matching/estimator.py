@@ -90,11 +90,8 @@ class TripleEstimator:
         events: Events | None = None,
         ledger: Ledger | None = None,
         sweeps: SharedSweeps | None = None,
-        whole: ReferenceIndex | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
-
-        `whole` is the map of which `index` is a part, near that circle.
 
         The `ledger` and the `sweeps` are shared with the estimators of other parts that are searched with this one.
         """
@@ -110,7 +107,7 @@ class TripleEstimator:
         self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Place] = []  # verified, and no better version of them is to be expected
         self.scene = scene
-        self.index, self.whole = index, whole or index
+        self.index = index
         self.options = options or MatchOptions()
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
@@ -131,13 +128,10 @@ class TripleEstimator:
         """The unit (N,) of each intersection of the map."""
         return cut_to_units(self.index.xy)
 
-    @cached_property
-    def unrestricted(self) -> TripleEstimator | None:
-        """The same on the whole map, whatever the hints on the place and the heading; None without these."""
-        camera = replace(self.options.camera, heading_deg=None, north_up=False)
-        if self.near is None and self.options.within is None and camera == self.options.camera:
-            return None
-        return TripleEstimator(self.scene, self.whole, replace(self.options, camera=camera, within=None))
+    @property
+    def is_told(self) -> bool:
+        """Whether hints on the place or the heading exclude most rivals."""
+        return self.near is not None or self.options.within is not None or self.options.camera.heading is not None
 
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.

@@ -25,7 +25,7 @@ from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.parts import Part, Whole
 from roadgeo.matching.picture import by_picture
 from roadgeo.matching.place import Place, Weight
-from roadgeo.matching.rivals import Rivals
+from roadgeo.matching.rivals import N_KNOWN, Rivals
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Ahead, Search, search_in_turn, search_together
@@ -59,6 +59,10 @@ class Searched:
     n_searched, n_tried, n_anchors : int
         Intersections of the part of the reference that was searched, places screened, and intersections of the query
         that were looked up.
+    likeliest : tuple of Place
+        The likeliest places that were verified, by traced roads alone.
+    better : Place or None
+        Where the roads fit better than at a place that hints led to (see `veto`).
     estimator, search : TripleEstimator, Search or None
         What searched, for explanation; None where nothing was to be searched, or by pairs.
     """
@@ -74,6 +78,8 @@ class Searched:
     match_s: float = 0.0
     refine_s: float = 0.0
     events: Events = field(default_factory=Events)
+    likeliest: tuple[Place, ...] = ()
+    better: Place | None = None
     estimator: TripleEstimator | None = None
     search: Search[Place] | None = None
 
@@ -238,7 +244,7 @@ def _begin(
         part = _part(index, near[:2], reach)
         if len(part) == 0:
             return Searched(index, events=events)
-    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps, index)
+    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
     return Searched(index, n_searched=len(part), events=events, estimator=estimator)
 
 
@@ -251,6 +257,7 @@ def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], riv
     return replace(
         begun,
         places=() if best is None or best.refined is None else _listed(estimator, best),
+        likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]),
         stopped=search.stopped,
         n_tried=estimator.n_screened,
         n_anchors=estimator.n_anchors,

@@ -35,7 +35,7 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["Compared", "Rivals", "log10_gap", "similar_places"]
+__all__ = ["N_KNOWN", "Compared", "Rivals", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -58,7 +58,7 @@ _MAY_LEAD = 0.5
 _DOUBT = 60.0
 #: Number of the likeliest places met by the search that are compared; and number of road points for the rough
 #: refinement of places around.
-_N_KNOWN, _N_POINTS = 12, 200
+N_KNOWN, _N_POINTS = 12, 200
 #: Number of the likeliest places around that are fully refined.
 _N_FITTED = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
@@ -129,7 +129,7 @@ class Rivals:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
         by_roads, estimator = self._by_roads(part), self.estimators[part]
         is_soft = estimator.scene.probability is not None
-        may_decide = (is_soft or estimator.unrestricted is not None) and time.perf_counter() <= self._deadline
+        may_decide = (is_soft or estimator.is_told) and time.perf_counter() <= self._deadline
         if by_roads is None or by_roads.score >= _CERTAIN or not may_decide:
             return by_roads
         started = time.perf_counter()
@@ -151,7 +151,7 @@ class Rivals:
 
     def _by_picture(self, estimator: TripleEstimator) -> Place:
         """Compare the place that the picture favours with its best rival."""
-        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:_N_KNOWN]
+        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]
         gsd_m = ranked[0].gsd_m
         best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
         for _ in range(_MOST_TURNS):
@@ -159,10 +159,7 @@ class Rivals:
             if not _is_beaten(compared):
                 break
             best = self._take(estimator, compared.rival, ranked)
-        if estimator.unrestricted is None or _is_beaten(compared):
-            return compared
-        free = self._compare_by_picture(estimator.unrestricted, compared, ranked)  # see `_compare`
-        return compared.but(score=max(compared.score, free.score))
+        return compared
 
     def _compare_by_picture(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
         """Compare a place with those that were met, and with those around, by the picture."""
@@ -188,9 +185,9 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[:_N_KNOWN], key=lambda place: place.log10_likelihood - _penalty(place))
+        best = max(ranked[:N_KNOWN], key=lambda place: place.log10_likelihood - _penalty(place))
         for _ in range(_MOST_TURNS):
-            key = best, *ranked[: 1 + _N_KNOWN]
+            key = best, *ranked[: 1 + N_KNOWN]
             compared = self._compared.get(key) or self._compare(estimator, best, ranked)
             self._compared[key] = compared
             if not _is_beaten(compared):
@@ -200,17 +197,7 @@ class Rivals:
         return compared
 
     def _compare(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
-        """Compare a place with its rivals, and with those that hints exclude where it leads these too by more.
-
-        Hints leave few rivals, by which a gap is hard to judge: without them a place would lead by less.
-        """
-        compared, unrestricted = self._compare_allowed(estimator, best, ranked), estimator.unrestricted
-        if unrestricted is None or _is_beaten(compared) or compared.score >= _CERTAIN:
-            return compared
-        free = self._compare_allowed(unrestricted, best, ranked)
-        return compared.but(score=max(compared.score, free.score))
-
-    def _compare_allowed(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
+        """Compare a place with its rivals, as far as hints allow them."""
         gave_up = best.refined is None and not math.isfinite(best.score)
         if gave_up or best.log10_likelihood < self.needed:
             return best.but(rival=None)
@@ -240,7 +227,7 @@ class Rivals:
             score = worth - rival.net if rival.net > worth else min(lead, worth) - against
             return best.but(score=score, rival=rival.place.but(by=Weight(rival.net, best.statement_px)))
 
-        others = [place for place in ranked[: 1 + _N_KNOWN] if place is not best]
+        others = [place for place in ranked[: 1 + N_KNOWN] if place is not best]
         met = (Compared(place, *compare(place.matrix), _penalty(place)) for place in others)
         rivals = list(filter(is_rival, met))
         compared = scored(rivals)

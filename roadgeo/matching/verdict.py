@@ -27,6 +27,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place as Hyp
 from roadgeo.matching.refinement import corner_sigmas
 from roadgeo.matching.scene import Query
+from roadgeo.matching.veto import broken_hints
 
 __all__ = ["center_of", "decide", "place_frame"]
 
@@ -59,13 +60,16 @@ def _judge(query: Query, found: Sequence[Searched], options: LocateOptions) -> L
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
     # The best place of all references, and the others.
-    candidates = _pool(found, options.min_log10_odds)
+    better = next((one.better for one in found if one.better is not None), None)
+    candidates = [*filter(None, [better]), *_pool(found, options.min_log10_odds)]
     best, rivals = (candidates[0] if candidates else None), candidates[1:]
     listed = _listed(found, candidates)
     places = tuple(_describe(location, query, listed, number, options) for number in range(1, 1 + len(listed)))
     if best is not None:
         runner_up = places[1] if rivals else None
         location = replace(location, log10_odds=best.score, runner_up=runner_up, alternatives=places[1:])
+    if better is not None:
+        return _fits_elsewhere(replace(location, log10_odds=None, alternatives=places), candidates, options)
     needed = options.min_log10_odds
     rival = None if best is None else _equal(best, rivals, needed)
     if best is None or (best.score < needed and rival is None):
@@ -253,6 +257,21 @@ def _refuse(
         attribution="; ".join(filter(None, owed)),
         reason=f"{reason} (looked on {names}; {done})",
     )
+
+
+def _fits_elsewhere(location: Location, candidates: Sequence[Hyp], options: LocateOptions) -> Location:
+    """Refuse what hints led to: the first of the candidates, which they exclude, explains more."""
+    better, *told = candidates
+    away_m = better.apart_m(told[0]) if told else None
+    ways = broken_hints(better, options)
+    where = "elsewhere" if away_m is None else _away(away_m)
+    reason = f"the roads fit better {where}, {', and '.join(ways)}" if ways else f"the roads fit better {where}"
+    return replace(_on(location, better.index), reason=reason, reason_code=Reason.FITS_ELSEWHERE)
+
+
+def _away(away_m: float) -> str:
+    """Say how far, in metres or kilometres."""
+    return f"{away_m:.0f} m away" if away_m < 1000.0 else f"{away_m / 1000.0:.1f} km away"
 
 
 def _why_nothing(query: Query, found: Searched, listed: Sequence[Hyp], options: LocateOptions) -> tuple[Reason, str]:

@@ -150,7 +150,12 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
     """Return the best answer, the first of equals; a rival elsewhere that is almost as sure makes it ambiguous."""
     rank = {"located": 2, "ambiguous": 1, "not_located": 0}
     best = max(
-        sightings, key=lambda sighting: (rank[sighting.location.status], sighting.location.log10_odds or -math.inf)
+        sightings,
+        key=lambda sighting: (
+            rank[sighting.location.status],
+            sighting.location.reason_code is Reason.FITS_ELSEWHERE,
+            sighting.location.log10_odds or -math.inf,
+        ),
     )
     locations = [sighting.location for sighting in sightings]
     location = replace(best.location, seconds=total_seconds(*(sighting.location.seconds for sighting in sightings)))

@@ -305,13 +305,3 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
     assert Rivals({item: estimator}, Ledger(), NEEDED).compare(item).score == pytest.approx(lead)
-
-
-def test_a_hint_never_lowers_the_lead_by_the_picture(plain, monkeypatch):
-    truth, index, evidence = plain
-    x, y = Homography(truth)(evidence.scene.center)
-    hinted = TripleEstimator(evidence.scene, index, near=(x, y, 100.0))
-    hinted.verified.append(Place(evidence.scene, index, truth))
-    lead = lambda _, at, best, *__: best.but(score=3.0 if at.near is None else 1.0)  # noqa: E731
-    monkeypatch.setattr(Rivals, "_compare_by_picture", lead)
-    assert Rivals({}, Ledger(), NEEDED)._by_picture(hinted).score == 3.0

@@ -1,0 +1,118 @@
+"""Hints that leave no rival prove nothing: a told place stands only if no other place explains more."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds.scenes import camera, look, random_network, scene_of
+
+from roadgeo.errors import Reason
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.location import Seconds
+from roadgeo.matching import veto
+from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import Searched, search_references
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.parts import Whole
+from roadgeo.matching.place import Place
+from roadgeo.matching.scene import Query
+from roadgeo.matching.shifts import Shift, move_about, shifted
+from roadgeo.matching.verdict import decide
+
+TRUTH = camera((1000, 1000), (1000, 1000), 1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def town():
+    network = random_network(21, 2000.0)
+    index, graph = build_index(network), look(network, TRUTH)
+    scene = scene_of(graph)
+    return Query("frame", scene, graph, Seconds()), index
+
+
+def told(town, east_m=0.0, radius_m=60.0, **camera):
+    """Options with a circle so far east of the truth."""
+    query, index = town
+    middle = Homography(TRUTH).everywhere(query.scene.center) + (east_m, 0.0)
+    lon, lat = to_lonlat(index.plane.crs, index.plane.to_crs(middle[None]))[0].tolist()
+    options = LocateOptions(near=(lon, lat, radius_m))
+    return replace(options, match=replace(options.match, camera=replace(CameraOptions(), **camera)))
+
+
+def answer(town, options, places):
+    """What is decided where hints lead to these places."""
+    query, index = town
+    searched = [Searched(index, tuple(places), n_searched=len(index))]
+    return decide(query, veto.contest(query, searched, [Whole(index)], options, 60.0), options)
+
+
+def found(town, options):
+    """The places of a search without hints, as if hints had led there."""
+    query, index = town
+    (one,) = search_references(query, [Whole(index)], veto.without_hints(options), 60.0)
+    return one.places
+
+
+def test_a_place_that_is_told_truly_stands(town):
+    options = told(town)
+    assert answer(town, options, found(town, options)).located
+
+
+def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_roads_fit_better(town):
+    query, index = town
+    options = told(town, 300.0, gsd_m=(0.95, 1.05))
+    (best, *_) = found(town, options)
+    wrong = best.but(matrix=shifted(best.matrix, 300.0, 0.0), score=9.0, rival=None)
+    wrong = replace(Place(query.scene, index, wrong.matrix), refined=best.refined, score=9.0)
+    location = answer(town, options, [wrong])
+    assert (location.status, location.reason_code) == ("not_located", Reason.FITS_ELSEWHERE)
+    away = "the roads fit better (299|300) m away, outside the circle given: leave --near out"
+    assert re.fullmatch(away, location.reason)
+    assert np.allclose((location.places[0].lon, location.places[0].lat), best.lonlat, atol=1e-5)
+
+
+def test_where_hints_lead_to_nothing_only_a_place_that_would_be_reported_is_named(town):
+    options = told(town, 700.0)
+    assert answer(town, options, []).reason_code is Reason.FITS_ELSEWHERE
+    strict = replace(options, min_log10_odds=1e6)
+    assert answer(town, strict, []).reason_code is Reason.NOTHING_STANDS_OUT
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "scale", "east_m", "is_other"),
+    [
+        (0.0, 1.0, 0.0, False),
+        (30.0, 1.0, 0.0, False),
+        (60.0, 1.0, 0.0, True),
+        (0.0, 1.2, 0.0, False),
+        (0.0, 1.3, 0.0, True),
+        (0.0, 1.0, 40.0, False),
+        (0.0, 1.0, 60.0, True),
+    ],
+)
+def test_another_place_lies_elsewhere_is_turned_or_is_of_another_size(town, turn_deg, scale, east_m, is_other):
+    query, index = town
+    middle = Homography(TRUTH).everywhere(query.scene.center)
+    moved = move_about(middle, Shift(east_m, 0.0, turn_deg, scale, 0.0)) @ TRUTH
+    assert veto._is_other(Place(query.scene, index, TRUTH), Place(query.scene, index, moved)) is is_other
+
+
+def test_each_hint_that_a_place_breaks_is_named(town):
+    query, index = town
+    options = told(town, 500.0, gsd_m=(2.0, 3.0), heading_deg=(90.0, 5.0))
+    options = replace(options, match=replace(options.match, within=(10.0, 10.0, 11.0, 11.0)))
+    ways = veto.broken_hints(Place(query.scene, index, TRUTH), options)
+    assert [way.split(": leave ")[1] for way in ways] == ["--near out", "--within out", "--gsd out", "--heading out"]
+    assert veto.broken_hints(Place(query.scene, index, TRUTH), told(town)) == []
+
+
+def test_without_hints_there_is_nothing_to_contest(town):
+    options = LocateOptions()
+    assert veto.without_hints(options) is None
+    wider = replace(options, match=replace(options.match, camera=CameraOptions(gsd_m=(0.4, 48.0))))
+    assert veto.without_hints(wider) is None  # all scales, in pixels four times as coarse
+    bare = veto.without_hints(told(town, gsd_m=(0.9, 1.1), heading_deg=(0.0, 5.0)))
+    assert bare == options
