@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from roadgeo.geometry.areas import lies_in
-from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, pose
+from roadgeo.geometry.camera import CameraOptions, pose
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.methods import Searched, search_references
@@ -46,7 +46,8 @@ def contest(
     """Return what a search with hints found; with the place where the roads fit better without them, if there is one.
 
     Where the told search found a place that would be reported, any other place that explains more is a better one.
-    Where it did not, only a place that would be reported itself is.
+    Where it did not, only a place that would be reported itself is. A better place that agrees with the hints is the
+    answer: what was found without them.
     """
     free, needed = without_hints(options), options.min_log10_odds
     leading = max(told, key=lambda one: one.places[0].score if one.places else -math.inf)
@@ -63,6 +64,8 @@ def contest(
     if not is_told:
         others = [place for place in others if place.score >= needed]
     better = _better(leading.places[0] if leading.places else None, others)
+    if better is not None and not broken_hints(better, options):  # hints led past it
+        return found
     spent_s = sum(one.match_s + one.refine_s for one in found)
     return [replace(one, better=better, match_s=one.match_s + spent_s) if one is leading else one for one in told]
 
@@ -102,6 +105,7 @@ def broken_hints(place: Place, options: LocateOptions) -> list[str]:
         ways.append("outside the area given: leave --within out")
     if not camera.gsd_m[0] <= place.gsd_m <= camera.gsd_m[1]:
         ways.append("at another scale than given: leave --gsd out")
-    if judge(place.matrix, place.scene.size, camera) is CameraFault.HEADING:
+    east, north = place.corners[0] - place.corners[3]
+    if camera.turned_off(east, north) > 0.0:
         ways.append("turned away from the heading given: leave --heading out")
     return ways

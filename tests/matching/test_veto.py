@@ -36,7 +36,7 @@ def town():
 def told(town, east_m=0.0, radius_m=60.0, **camera):
     """Options with a circle so far east of the truth."""
     query, index = town
-    middle = Homography(TRUTH).everywhere(query.scene.center) + (east_m, 0.0)
+    middle = Homography(TRUTH).everywhere(query.scene.center) + np.array([east_m, 0.0])
     lon, lat = to_lonlat(index.plane.crs, index.plane.to_crs(middle[None]))[0].tolist()
     options = LocateOptions(near=(lon, lat, radius_m))
     return replace(options, match=replace(options.match, camera=replace(CameraOptions(), **camera)))
@@ -72,6 +72,11 @@ def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_
     away = "the roads fit better (299|300) m away, outside the circle given: leave --near out"
     assert re.fullmatch(away, location.reason)
     assert np.allclose((location.places[0].lon, location.places[0].lat), best.lonlat, atol=1e-5)
+
+
+def test_a_place_that_agrees_with_the_hints_and_that_they_led_past_is_the_answer(town):
+    options = told(town)
+    assert answer(town, options, []).located
 
 
 def test_where_hints_lead_to_nothing_only_a_place_that_would_be_reported_is_named(town):
