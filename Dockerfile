@@ -11,7 +11,7 @@ RUN useradd --create-home --uid 1000 roadgeo \
     && chown -R roadgeo /opt/roadgeo /work
 
 COPY --chown=roadgeo . /opt/roadgeo/source
-RUN pip install --constraint /opt/roadgeo/source/constraints.txt "/opt/roadgeo/source[desktop]"
+RUN pip install --constraint /opt/roadgeo/source/constraints.txt /opt/roadgeo/source
 
 USER 1000
 WORKDIR /work

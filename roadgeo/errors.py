@@ -32,11 +32,14 @@ __all__ = [
 
 #: Packages by the extra, or else the package, to install for them. Onboard computers may lack those without an extra.
 _BRINGS = {
-    **dict.fromkeys(("mapbox_vector_tile", "python_multipart", "starlette", "uvicorn"), "serve"),
-    **dict.fromkeys(("geopandas", "pandas", "pyogrio"), "geopandas"),
     "pymavlink": "mavlink",
+    "pandas": "geopandas",
     **{
-        name: name for name in ("networkx", "onnxruntime", "osmium", "osmnx", "pyarrow", "requests", "scipy", "shapely")
+        name.replace("-", "_"): name
+        for name in (
+            *("geopandas", "h11", "mapbox-vector-tile", "networkx", "onnxruntime", "osmium", "osmnx", "pyarrow"),
+            *("pyogrio", "python-multipart", "requests", "scipy", "shapely", "starlette", "uvicorn"),
+        )
     },
 }
 

@@ -40,8 +40,7 @@ def test_the_conda_recipe_is_of_this_version_and_needs_the_same() -> None:
     assert f"homepage: {PROJECT['urls']['Homepage']}" in recipe
     needed = recipe.split("  run:\n")[1].split("\n\n")[0]
     listed = re.findall(r"- ([\w-]+) (>=[\d.]+)", needed)
-    extras = PROJECT["optional-dependencies"]
-    every = {*PROJECT["dependencies"], *extras["serve"]}
+    every = set(PROJECT["dependencies"])
     asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", item).groups() for item in every]
     expected = {(ON_CONDA.get(name, name), version) for name, version in asked}
     assert set(listed) == {("python", PROJECT["requires-python"]), *expected}
@@ -52,7 +51,7 @@ def test_a_missing_package_is_named_with_what_brings_it() -> None:
     left_out = [name for name in map(_name_of, PROJECT["dependencies"]) if name not in ON_BOARD | {"protobuf"}]
     for brings, package in [
         *((package, package) for package in left_out),
-        *((extra, _name_of(item)) for extra in ("serve", "mavlink") for item in extras[extra]),
+        *((extra, _name_of(item)) for extra in ("mavlink",) for item in extras[extra]),
     ]:
         module = package.replace("-", "_")
         reported = str(name_package(ModuleNotFoundError(name=f"{module}.part")))
@@ -72,7 +71,7 @@ def test_the_constraints_pin_every_package_within_its_bounds() -> None:
     extras = PROJECT["optional-dependencies"]
     asked = [
         *PROJECT["dependencies"],
-        *(item for name in extras if name not in {"desktop", "dev"} for item in extras[name]),
+        *(item for name in extras if name != "dev" for item in extras[name]),
     ]
     for name, least in (re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", query).groups() for query in asked):
         versions = [tuple(map(int, version.split("."))) for package, version in pinned if package == name]

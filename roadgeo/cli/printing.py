@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 
@@ -22,8 +23,10 @@ def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
 
 
 def keep_switch(context: click.Context, parameter: click.Parameter, given: bool) -> None:
-    """Keep a switch of the command that runs for all that prints, as click calls back."""
+    """Keep a switch of the command that runs for all that prints, as click calls back; --quiet for the log, too."""
     context.meta[f"roadgeo.{parameter.name}"] = given
+    if parameter.name == "quiet":
+        logging.getLogger("roadgeo").setLevel(logging.ERROR if given else logging.WARNING)
 
 
 def is_set(switch: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -40,8 +40,8 @@ class ReadOptions:
         Whether what is given is mirrored. Default: as the georeference of its file says.
     units : "auto", "pixels" or "metres"
         Unit of roads that come as lines (see `sources.drawn_roads`).
-    layer : str, sequence of str or None
-        Layer of such roads, where their file has several.
+    layer : tuple of str
+        Layers of such roads, where their file has several.
     aspect : float or None
         How many times a pixel is as wide as high. Default: as the georeference of its file says, or once.
     bands : (3,) tuple of int, or None
@@ -56,7 +56,7 @@ class ReadOptions:
     threads: int = 1
     mirror: bool | None = None
     units: Literal["auto", "pixels", "metres"] = "auto"
-    layer: str | Sequence[str] | None = None
+    layer: tuple[str, ...] = ()
     aspect: float | None = None
     bands: tuple[int, int, int] | None = None
     names: tuple[str, ...] = ()

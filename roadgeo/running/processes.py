@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -25,6 +26,8 @@ from roadgeo.running.pool import Died, Ended, Pool, Ready, Work
 from roadgeo.storage.files import remove_own
 
 __all__ = ["Processes", "end_with_parent", "run", "tell", "without_interrupts"]
+
+_log = logging.getLogger("roadgeo")  # of all modules
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -173,7 +176,7 @@ class _Process:
             context.set_forkserver_preload(_PRELOAD)
         self._pipe, theirs = context.Pipe()
         with theirs:
-            process = context.Process(target=_serve, args=(theirs, *self.given), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, _log.level, *self.given), daemon=True)
             with without_interrupts():
                 process.start()
         self.process, self._start_s = process, _START_S
@@ -231,7 +234,7 @@ def tell(text: str, share: float | None = None) -> None:
         pipe.send(("told", text, share))
 
 
-def _serve(pipe: Connection, work: Ready[Any, Any], clean: Callable[[], None] | None) -> None:
+def _serve(pipe: Connection, level: int, work: Ready[Any, Any], clean: Callable[[], None] | None) -> None:
     """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
@@ -240,6 +243,7 @@ def _serve(pipe: Connection, work: Ready[Any, Any], clean: Callable[[], None] | 
         import cv2
 
         cv2.setNumThreads(1)  # the processes share the processors already
+        _log.setLevel(level)
         _parents[:] = [pipe]
         kind, do = _reply(work.prepare)
         with contextlib.suppress(EOFError, OSError):

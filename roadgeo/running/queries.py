@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from roadgeo._text import visible
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference, swapped_near
 from roadgeo.running.choosing import choose_place
@@ -75,11 +78,16 @@ def _look_for(
 ) -> Sighting:
     if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
         return _locate_lines(path, references, options, reading, undoing(how, None, bool(reading.mirror)))
-    aspect, is_mirrored = read_pixel_shape(path) if isinstance(path, str) else (None, False)
-    mirror = is_mirrored if reading.mirror is None else reading.mirror
-    how = undoing(how, aspect if reading.aspect is None else reading.aspect, mirror)
-    sighting = _look_at(path, references, options, reading, how, say)
-    if mirror and reading.mirror is None:
+    stated = cache(lambda: read_pixel_shape(path) if isinstance(path, str) else (None, False))
+
+    def upright(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
+        aspect, is_mirrored = stated()  # now that the file was found to be a picture
+        aspect = aspect if reading.aspect is None else reading.aspect
+        mirror = is_mirrored if reading.mirror is None else reading.mirror
+        return undoing(how, aspect, mirror)(mask, references, options)
+
+    sighting = _look_at(path, references, options, reading, upright, say)
+    if reading.mirror is None and stated()[1]:
         reason = f"{sighting.location.reason}; the georeference of the file mirrors it, which was undone"
         sighting = replace(sighting, location=replace(sighting.location, reason=reason))
     return sighting
@@ -201,7 +209,7 @@ def _locate_lines(
     path: str, references: Sequence[AnyReference], options: LocateOptions, reading: ReadOptions, how: Locate
 ) -> Sighting:
     """Locate roads given as lines; their units restrict scale and north unless the user gives narrower limits."""
-    drawing, camera = draw_roads(path, reading.units, reading.layer), options.match.camera
+    drawing, camera = draw_roads(path, reading.units, reading.layer or None), options.match.camera
     if drawing.middle is not None and swapped_near((*drawing.middle, 1000.0), references) is not None:
         _LOG.warning("%s: its coordinates lie on none of the maps; %s", visible(path), EXCHANGED)
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:

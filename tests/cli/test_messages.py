@@ -26,7 +26,7 @@ def drone() -> np.ndarray:
 
 def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_streets(tmp_path / "a.gpkg")
-    index = ["index", "--roads", "a.gpkg", "--out", "b.gpkg", "--replace", "-q", "--crs"]
+    index = ["index", "--roads", "a.gpkg", "--out", "b.gpkg", "--replace", "--crs"]
     assert main([*index, "EPSG:4258"]) == 0
     assert "a.gpkg: says that its CRS is EPSG:4326; read as EPSG:4258, as --crs asks" in caplog.text
     caplog.clear()
@@ -34,6 +34,9 @@ def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogC
     assert not caplog.text
     assert main([*index, "EPSG:26986"]) == 1  # degrees cannot be its metres
     assert "says that its CRS is EPSG:4326" in caplog.text
+    caplog.clear()
+    assert main([*index, "EPSG:4258", "-q"]) == 0
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])

@@ -84,7 +84,15 @@ def test_how_images_are_read_reaches_each_command(tmp_path: Path) -> None:
     frames = _frame_options(
         given(
             track_command,
-            *(f"--segmenter={model}", "--recursive", "--gsd=0.3", "--motion-sigma=3", "--every=2", "--interval=4"),
+            *(
+                f"--segmenter={model}",
+                "--recursive",
+                "--gsd=0.3",
+                "--motion-sigma=3",
+                "--every=2",
+                "--interval=4",
+                "--aspect=1.2",
+            ),
         )
     )
     check(frames.reading, model)
@@ -100,5 +108,5 @@ def test_how_images_are_read_reaches_each_command(tmp_path: Path) -> None:
 def test_what_locate_alone_reads() -> None:
     reported = given(locate_command, "--mirror", "--aspect=1.5", "--units=metres", "--layer=roads")
     reading = read_options(reported, jobs=2)
-    assert (reading.mirror, reading.aspect, reading.units, reading.layer) == (True, 1.5, "metres", "roads")
+    assert (reading.mirror, reading.aspect, reading.units, reading.layer) == (True, 1.5, "metres", ("roads",))
     assert reading.threads == 1

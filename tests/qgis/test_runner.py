@@ -67,8 +67,8 @@ def test_messages_of_the_program_name_what_qgis_has() -> None:
     text = "Give one source: --osm PLACE, or `roadgeo index --bbox`; `roadgeo simulate` and --gsd-like stay"
     shown = runner.in_words_of_qgis(text, labels)
     assert shown == "Give one source: “Place” PLACE, or “Build road reference”; `roadgeo simulate` and --gsd-like stay"
-    text = "this needs uvicorn, which is not installed: pip install 'roadgeo[serve]'"
-    assert runner.in_words_of_qgis(text, {}).endswith("“Set up roadgeo” installs roadgeo[serve]")
+    text = "this needs pymavlink, which is not installed: pip install 'roadgeo[mavlink]'"
+    assert runner.in_words_of_qgis(text, {}).endswith("“Set up roadgeo” installs roadgeo[mavlink]")
 
 
 # --- running it -------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ __all__ = ["ENVIRONMENT", "SOURCE", "ask_version", "install"]
 ENVIRONMENT = Path(QgsApplication.qgisSettingsDirPath()).parents[1] / "roadgeo"
 
 #: The requirement for pip: the wheel that came with the plugin, as a package; else the package that pip finds.
-SOURCE = f"{next(map(str, Path(__file__).parent.glob('roadgeo-*.whl')), 'roadgeo')}[desktop]"
+SOURCE = next(map(str, Path(__file__).parent.glob("roadgeo-*.whl")), "roadgeo")
 
 #: A Python has to be new enough, and have venv and pip; it prints its version in any case.
 _TRIAL = "import sys; print(sys.version.split()[0]); import ensurepip, venv; sys.exit(sys.version_info < (3, 11))"

@@ -389,7 +389,7 @@ SETUP = (
         Option(
             QgsProcessingParameterString, "SOURCE", "What to install",
             "As pip takes it: the wheel that came with the plugin, or another, a folder of sources or an address, in "
-            "full. [desktop] adds all that building references and photographs need.",
+            "full.",
             settings={"defaultValue": SOURCE},
         ),
         Option(
