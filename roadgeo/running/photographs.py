@@ -93,8 +93,9 @@ class Frame:
         On which roads are traced.
     coarser : float
         Pixels of the photograph for each of the grid, along a side.
-    n_scales : int
-        Number of scales worth trying.
+    n_scales, n_further : int
+        Number of scales worth trying; and of those beyond a scale that is told. That says how large the ground is, not
+        at which scale the model sees it best.
     """
 
     def __init__(self, photograph: Photograph, reading: ReadOptions, gsd_m: tuple[float, float], say: Say) -> None:
@@ -106,26 +107,32 @@ class Frame:
         self._seen: dict[tuple[float, int], ProbabilityMap] = {}
         k = max(1, math.ceil(math.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS)))
         self.own = round(photograph.height / k), round(photograph.width / k)
-        self._scales, self.n_scales = self._known_scales()
+        self._scales, self.n_scales, self.n_further = self._known_scales()
         finer = _how_much_finer(self.own, self.scale(0))
         self.grid, self.coarser = (round(finer * self.own[0]), round(finer * self.own[1])), k / finer
 
-    def _known_scales(self) -> tuple[list[float], int]:
-        """Return the scales that are known, and how many there are with others: one where a pixel's size is known."""
+    def _known_scales(self) -> tuple[list[float], int, int]:
+        """Return the scales that are known, and how many there are with others: one where a pixel's size is known.
+
+        And how many further ones there are then.
+        """
         low, high = self.gsd_m
         if high <= _KNOWN_SPAN * low:
-            return [scale_of(math.sqrt(low * high), self.network)], 1
+            told = scale_of(math.sqrt(low * high), self.network)
+            further = [scale for scale in try_scales(self.photograph, self.network) if scale != told]
+            return [told], 1, min(_MAX_SCALES, len(further))
         stated = estimate_gsd(self.photograph.name)
         known = [scale_of(stated, self.network)] if stated is not None and low <= stated <= high else []
-        return known, min(_MAX_SCALES, len(known) + len(try_scales(self.photograph, self.network, self.gsd_m)))
+        n_scales = len(known) + len(try_scales(self.photograph, self.network, self.gsd_m))
+        return known, min(_MAX_SCALES, n_scales), 0
 
     def scale(self, rank: int) -> float:
         """Return a scale worth trying; where it is not known, the photograph is shown to the model at many."""
         if rank >= len(self._scales):
             self.say(f"looking for the scale of {self.photograph.name}")
-            found = rank_scales(self.photograph, self.network, self.gsd_m)
+            found = rank_scales(self.photograph, self.network, *() if self.n_further else (self.gsd_m,))
             self._seen.update({(scale, 1): seen for scale, seen in found.items() if seen is not None})
-            self._scales += found
+            self._scales += [scale for scale in found if not self.n_further or scale not in self._scales]
         return self._scales[rank]
 
     def looks(self) -> list[Look]:
@@ -134,7 +141,8 @@ class Frame:
         The model is shown it in one way first where that was done already, but not at the next finer scale, and where
         there is much to show. Beyond scales that were tried a model of others is shown it in more ways:
         of 60 photographs whose scale was unknown none was located so, and it was half of a refusal's time. Where one
-        scale is known, the two scales that were shown together are looked at alone as well.
+        scale is known, the two scales that were shown together are looked at alone as well, and the scales of a
+        photograph whose scale is unknown last.
         """
         best = self.scale(0)
         in_one = self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS
@@ -148,7 +156,7 @@ class Frame:
             looks.append(Look(ways=most, lower=True, note=", a lower threshold"))
         if not has_more and self.n_scales == 1 and self._may_be_finer(best):
             looks += [Look(finer=finer, ways=1, note=", shown alone") for finer in (1.0, _FINER)]
-        return looks
+        return looks + [Look(rank, as_shown=True) for rank in range(1, 1 + self.n_further)]
 
     def look(self, look: Look) -> Seen:
         """Return the roads seen in one look, on the grid.

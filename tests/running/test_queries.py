@@ -90,7 +90,7 @@ def test_the_second_look_shows_the_photograph_more_ways(
     taken: list[str] = []
 
     def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.note for look in looks)
+        taken.extend(look.note for look in looks if look.rank == 0)
         raise MaskError("that is all")
 
     monkeypatch.setattr(photographs, "locate_looks", note)
@@ -172,6 +172,23 @@ def test_a_scale_that_was_tried_alone_is_not_shown_finer(
                 frame.look(look)
     photographs.load_model.cache_clear()
     assert not shown
+
+
+def test_a_told_scale_takes_no_scale_from_the_looks_of_a_photograph_whose_scale_is_unknown(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says how large the ground is, not at which scale the model sees it best; it comes first."""
+    monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {1.0: NOTHING, 0.5: NOTHING, 2.0: None})
+    monkeypatch.setattr(photographs, "try_scales", lambda *_: (0.5, 1.0, 2.0))
+    with photographs.open_frame(str(photo), ReadOptions(segment="always"), (0.95, 1.05), lambda *_: None) as frame:
+        looks = frame.looks()
+        assert [look.rank for look in looks[-frame.n_further :]] == [1, 2, 3]
+        assert {look.rank for look in looks[: -frame.n_further]} == {0}
+        told, *further = [frame.scale(rank) for rank in range(4)]
+    photographs.load_model.cache_clear()
+    assert told == pytest.approx(photographs.scale_of(1.0, frame.network), rel=0.01)
+    assert further == [1.0, 0.5, 2.0]
 
 
 def test_a_photograph_is_located(
