@@ -53,6 +53,15 @@ _LIMITED = re.compile(
 _BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
 _ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*(?:<[?!].*?>\s*)*<([\w:.-]+)"), 1 << 12
 _ENDS_BYTES = 1 << 16  # of a file, where it says so
+_TILES = "vector tiles, which cut roads at their borders and simplify them; give the data that they were made of"
+#: Formats that are not read, and what their users do.
+_ELSEWHERE = {
+    **dict.fromkeys((".mbtiles", ".pmtiles", ".mvt"), _TILES),
+    ".osc": "holds changes alone; apply them to their map (osmium apply-changes), and give that",
+    **dict.fromkeys((".dwg", ".dgn"), "a drawing in a format that is not read; save it as DXF"),
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save it as CSV with a column of WKT, or as GeoPackage"),
+    **dict.fromkeys((".xz", ".7z", ".rar", ".tar", ".tgz", ".zst"), "packed in a way that is not read; unpack it"),
+}
 _EXPECTED = (
     "expected a path, a GeoDataFrame, a GeoSeries, a table of pandas, polars or pyarrow with a column of WKB or WKT, "
     "a graph of osmnx or momepy, shapely lines, or arrays of coordinates of shape (N, 2)"
@@ -87,6 +96,8 @@ def stream_tables(
         The file is unreadable, or which of its layers is meant is not known.
     """
     name = path.name.lower()
+    if why := _ELSEWHERE.get(path.suffix.lower()):
+        raise RoadSourceError(f"{path}: {why}")
     if name.endswith(OSM_ENDINGS):
         yield from stream_ways(path, most, advance, folder)
     elif name.endswith(_GRAPHS):

@@ -15,12 +15,13 @@ import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._arrays import AnyArray, BoolArray, IntArray
 from roadgeo.roads.kinds import KNOWN_HIGHWAYS, NO_ROADS, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, objects, simple_areas, simple_lines
 from roadgeo.storage.crs import crs_name
@@ -111,9 +112,12 @@ class Schema:
         if whole and self.is_guess:
             kinds, others = np.where(others, "", kinds), np.zeros_like(others)
         shapes = table.shapes[~others]
-        lines, place = simple_lines(shapes)
+        parted, of, in_part = shapes, np.arange(len(shapes)), np.zeros(len(shapes), bool)
+        if "road_flags" in columns:
+            parted, of, in_part = _parted(shapes, columns["road_flags"][~others])
+        lines, place = simple_lines(parted)
         areas = simple_areas(shapes)
-        row = np.flatnonzero(~others)[place]
+        row = np.flatnonzero(~others)[of[place]]
         hidden = [_each(columns[name], _HIDDEN.get(name, _itself)) for name in _TUNNELS if name in columns]
         hidden += [_tag(columns[name], "tunnel") for name in _TAGS if name in columns]
         tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
@@ -126,7 +130,7 @@ class Schema:
             crs_name(table.crs),
             kinds[row],
             np.full(len(row), "", object) if called is None else _each(called[row], _text),
-            np.logical_or.reduce([np.zeros(len(row), bool), *tunnels]),
+            np.logical_or.reduce([in_part[place], *tunnels]),
             bool(self.kinds),
             {"features": len(table.shapes)} | {key: value for key, value in told.items() if value},
             areas,
@@ -273,13 +277,40 @@ def _tag(values: AnyArray, key: str) -> AnyArray:
     return _each(values, find)
 
 
-def _flags(value: Any) -> Any:
+def _rules(value: Any) -> list[tuple[Any, list[str]]]:
+    """Return Overture's flags of a segment: each with the part that it holds for, two shares of its length, or None."""
+    rules, lists = _json(value), list | tuple | np.ndarray
+    known = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
+    return [
+        (rule.get("between"), [*map(str, flags)]) for rule in known if isinstance(flags := rule.get("values"), lists)
+    ]
+
+
+def _flags(value: Any) -> list[str]:
     """Return Overture's flags that hold for a whole segment."""
-    rules = _json(value)
-    rules = rules if isinstance(rules, list | tuple | np.ndarray) else ()
-    whole = [rule for rule in rules if isinstance(rule, dict) and rule.get("between") is None]
-    found = [rule.get("values") for rule in whole]
-    return [str(flag) for flags in found if isinstance(flags, list | tuple | np.ndarray) for flag in flags]
+    return [flag for part, flags in _rules(value) if part is None for flag in flags]
+
+
+def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, BoolArray]:
+    """Cut segments where Overture has a part of them in a tunnel; return pieces, whose each is, and if it is hidden."""
+    import shapely
+    from shapely.ops import substring
+
+    pieces: list[tuple[Any, int, bool]] = []
+    for k, (shape, value) in enumerate(zip(shapes, values, strict=True)):
+        parts = [part for part, flags in _rules(value) if part is not None and in_tunnel(objects([";".join(flags)]))[0]]
+        if not parts or not isinstance(shape, shapely.LineString):
+            pieces.append((shape, k, False))
+            continue
+        ends = sorted({0.0, 1.0, *(min(max(float(end), 0.0), 1.0) for part in parts for end in part)})
+        for low, high in pairwise(ends):
+            hidden = any(part[0] <= (low + high) / 2 <= part[1] for part in parts)
+            pieces.append((substring(shape, low, high, normalized=True), k, hidden))
+    return (
+        objects(piece for piece, _, _ in pieces),
+        np.array([k for _, k, _ in pieces], np.intp),
+        np.array([hidden for _, _, hidden in pieces], np.bool_),
+    )
 
 
 def _text(value: Any) -> str:

@@ -1,6 +1,7 @@
 """Tables of all schemas, in all containers, give the same roads."""
 
 import gzip
+import json
 import logging
 
 import geopandas as gpd
@@ -247,3 +248,38 @@ def test_lines_that_are_taken_without_a_kind_are_told(tmp_path, caplog):
     file = write_vector(tmp_path / "a.gpkg", lines, highway=["residential", None, None])
     assert len(read_roads(file).lines) == 3
     assert "2 of 3 lines have no kind of road; they are taken" in caplog.text
+
+
+@pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
+def test_a_part_of_a_segment_in_a_tunnel_is_cut_out(tmp_path, container):
+    """Overture's `between`: shares of the length."""
+    line = shapely.LineString([(0, 0), (0, 0.01)])
+    rules = [
+        [{"values": ["is_tunnel"], "between": [0.2, 0.5]}, {"values": ["is_bridge"], "between": [0.7, 0.8]}],
+        [{"values": ["is_tunnel"], "between": None}],
+        [{"values": ["is_link"], "between": [0.0, 1.0]}],
+        None,
+    ]
+    columns = {"class": ["secondary"] * 4, "subtype": ["road"] * 4, "road_flags": rules}
+    shapes = [shapely.affinity.translate(line, k / 100) for k in range(4)]
+    if container in ("frame", "parquet"):
+        table = gpd.GeoDataFrame(columns, geometry=shapes, crs=4326)
+        table.to_parquet(tmp_path / "a.parquet")
+        source = table if container == "frame" else tmp_path / "a.parquet"
+    else:
+        columns["road_flags"] = [rule and json.dumps(rule) for rule in rules]
+        source = write_vector(tmp_path / f"a.{container}", shapes, **columns)
+    found = choose_roads(source)
+    lengths = shapely.length(found.lines) / shapely.length(choose_roads(source, tunnels=True).lines).max()
+    assert sorted(lengths.tolist()) == pytest.approx([0.2, 0.5, 1.0, 1.0], abs=1e-3)
+    assert shapely.length(choose_roads(source, tunnels=True).lines).sum() == pytest.approx(4 * 1105.7, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [("a.mbtiles", "tiles"), ("a.pmtiles", "tiles"), ("a.osc", "changes"), ("a.dwg", "DXF"), ("a.xlsx", "CSV")],
+)
+def test_formats_that_are_not_read_say_what_to_do(tmp_path, name, word):
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(RoadSourceError, match=word):
+        choose_roads(tmp_path / name)
