@@ -82,8 +82,8 @@ def test_overture_segments(tmp_path):
     )
     frame.to_parquet(tmp_path / "segments.parquet")
     read = read_lines(tmp_path / "segments.parquet")
-    assert read.highway.tolist() == ["residential", "primary", "service"]
-    assert read.tunnel.tolist() == [False, True, False]
+    assert read.highway.tolist() == ["residential", "primary", "service", "service", "service"]
+    assert read.tunnel.tolist() == [False, True, False, True, False]
     assert "Overture" in read.meta["attribution"]
 
 
