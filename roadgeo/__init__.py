@@ -15,8 +15,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-#: Packaging reads it here without importing anything; nothing heavy may be imported above.
-__version__ = "1.0.0"
+from roadgeo._version import __version__
 
 if TYPE_CHECKING:
     from roadgeo.api import Answer, index, locate, track, vectorize, verify

@@ -126,7 +126,7 @@ def locate(
     focal: float | Literal["exif"] | None = None,
     effort: Literal["quick", "full"] | None = None,
     time_limit: float | None = None,
-    take: int | None = None,
+    take: int | tuple[float, float] | None = None,
 ) -> Answer:
     """Find where a photograph, or a mask of roads, lies on a map. Nothing is written.
 
@@ -163,9 +163,9 @@ def locate(
         Whether the search ends early, or roads alone are searched too (the default).
     time_limit : float
         Seconds after which the search stops.
-    take : int
-        Where nothing is located: the place, counted from 1 among `alternatives`, that is the answer; its status is
-        "chosen". The place that an ambiguous answer shows is the first.
+    take : int or (longitude, latitude)
+        The place, counted from 1 among `places` or nearest to this one, that is the answer; its status is "chosen".
+        Of an answer that is there already, `answer.take` takes a place without another search.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def locate(
         A hint makes no sense; `near` lies on no map, but would with longitude and latitude exchanged.
     """
     from roadgeo.running.batch import changed_options
-    from roadgeo.running.choosing import choose_place
+    from roadgeo.running.choosing import take_place
     from roadgeo.running.looks import Sighting
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.pictures import pixels_of, read_picture
@@ -198,19 +198,19 @@ def locate(
         "time_limit": time_limit,
     }
     options = _with_hints(options or LocateOptions(), given, mask)
-    if take is not None:
-        if take < 1:
-            raise ValueError(f"take={take!r}: places are counted from 1")
-        options = replace(options, take=take)
+    if isinstance(take, int) and take < 1:
+        raise ValueError(f"take={take!r}: places are counted from 1")
     references = _open(reference)
     meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
     picture = None if isinstance(mask, RoadMask) else read_picture(mask)
     if picture is None:
-        sighting = Sighting(choose_place(locate_mask(mask, references, options), options), mask)
+        sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
         sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
+    if take is not None:
+        sighting = sighting.told(take_place(sighting.location, take, options))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
     origin = {"options": changed, "reference_digest": digest_of(references, sighting.location.reference)}
     found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}

@@ -1,40 +1,25 @@
-"""The answer: where a mask lies on the map, how sure that is, or why it has no place (schema `roadgeo.location/1`)."""
+"""The answer: where an image lies on the map, how sure that is, or why it has no place (`roadgeo.location/1`)."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import FloatArray
+from roadgeo._version import __version__
 from roadgeo.errors import NotLocatedError, Reason, name_package
-from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.lens import Lens
-from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.placement import Camera, Center, Placement
 from roadgeo.geometry.uncertainty import CenterError
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
-__all__ = [
-    "ERROR_RATES",
-    "SCHEMA",
-    "Camera",
-    "ErrorRate",
-    "Evidence",
-    "Location",
-    "Place",
-    "Reason",
-    "Seconds",
-    "Seen",
-    "Stats",
-    "Status",
-]
+__all__ = ["ERROR_RATES", "SCHEMA", "Content", "ErrorRate", "Location", "Reason", "Seconds", "Spent", "Stats", "Status"]
 
 SCHEMA = "roadgeo.location/1"
 
@@ -70,91 +55,6 @@ ERROR_RATES = (
 
 
 @dataclass(frozen=True)
-class Place:
-    """A point on the map with its odds: the centre of a footprint.
-
-    Attributes
-    ----------
-    footprint_lonlat : tuple of 4 (lon, lat), or None
-        Corners TL, TR, BR, BL of the frame; None where they are not known.
-    frame : Location or None
-        All that follows from this place, where it may be taken (see `LocateOptions.take`).
-    """
-
-    x: float
-    y: float
-    lon: float
-    lat: float
-    log10_odds: float
-    footprint_lonlat: tuple[tuple[float, float], ...] | None = field(default=None, repr=False)
-    frame: Location | None = field(default=None, repr=False, compare=False)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Where the camera was, and how it pointed (see `geometry.pose`).
-
-    Attributes
-    ----------
-    x, y : float
-        In the location's CRS.
-    height_m : float
-        Above the ground in the frame, taken for level.
-    heading_deg, pitch_deg, roll_deg : float
-        Angles of an aircraft that looks straight down from its belly, its nose at the image's top: heading clockwise
-        from true north, pitch positive with the nose up, roll with the right wing down.
-    focal_px, focal_sigma_px : float
-        Focal length in pixels of the mask, and its standard deviation: 0 where it was given.
-    source : str
-        Origin of the focal length, as in `Location.tilt_source`.
-    covariance : (6, 6) float64
-        Covariance of x, y and height, metres, and of the three angles, degrees.
-    rotation : (3, 3) float64
-        Axes of the camera (x right, y to the image's top, z backwards) to east, north and up.
-    ground_m, ground_spread_m : float or None
-        Mean height of the ground in the frame by a terrain model, and its standard deviation; None: none was given.
-    """
-
-    x: float
-    y: float
-    lon: float
-    lat: float
-    height_m: float
-    heading_deg: float
-    pitch_deg: float
-    roll_deg: float
-    focal_px: float
-    focal_sigma_px: float
-    source: str
-    covariance: FloatArray = field(repr=False)
-    rotation: FloatArray = field(repr=False)
-    ground_m: float | None = None
-    ground_spread_m: float | None = None
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle of the optical axis from the vertical."""
-        return float(np.degrees(np.arccos(min(1.0, float(self.rotation[2, 2])))))
-
-    @property
-    def altitude_m(self) -> float | None:
-        """Height in the terrain model's system; None without one."""
-        return None if self.ground_m is None else self.ground_m + self.height_m
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        sigma = np.sqrt(np.diag(self.covariance)).tolist()
-        names = ("x_m", "y_m", "height_m", "heading_deg", "pitch_deg", "roll_deg")
-        plain = ("x", "y", "lon", "lat", *names[2:], "ground_m", "ground_spread_m", "altitude_m", "focal_px", "source")
-        return {
-            **{name: getattr(self, name) for name in plain},
-            "sigma": {**dict(zip(names, sigma, strict=True)), "focal_px": self.focal_sigma_px},
-            "covariance": self.covariance.tolist(),
-            "rotation": self.rotation.tolist(),
-        }
-
-
-@dataclass(frozen=True)
 class Seconds:
     """Wall time of each step, seconds; of several places the best is chosen within `match`."""
 
@@ -186,95 +86,71 @@ class Stats:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Contents of the mask in the query plane, pixels (see `geometry.mask`): roads, and (N, 2) intersections."""
-
-    graph: RoadGraph
-    xy: FloatArray
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """The matches behind the answer, for drawing it. Dimensions: M matched intersections.
+class Spent:
+    """What an answer cost.
 
     Attributes
     ----------
-    query_graph : RoadGraph
-        The mask's roads in the query plane, pixels (see `geometry.mask`).
-    query_xy : (M, 2) float64
-        Matched intersections, query plane.
-    reference_xy : (M, 2) float64
-        Their counterparts on the map, in the location's CRS.
-    residual_m : (M,) float64
-        Distances between the mapped query intersections and their counterparts.
+    stopped : str
+        Why the search ended: "accepted", "exhausted" (nothing was left to try), or at a limit, "work" or "time". Only
+        with "time" may the answer depend on the machine and its load. "" where no search was needed.
     """
 
-    query_graph: RoadGraph
-    query_xy: FloatArray
-    reference_xy: FloatArray
-    residual_m: FloatArray
+    seconds: Seconds = field(default_factory=Seconds)
+    stats: Stats = field(default_factory=Stats)
+    stopped: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What an image shows. Dimension: N intersections.
+
+    Attributes
+    ----------
+    size : (width, height)
+        Of the image, pixels.
+    graph : RoadGraph or None
+        Its roads in the query plane, pixels (see `geometry.mask`); None where they are not at hand.
+    xy : (N, 2) float64
+        Its intersections, query plane.
+    part : str
+        What was read of a file that holds more: "band 2 (road) of 3", "page 1 of 2"; "" where that is all.
+    lines_to_pixels : (3, 3) float64 or None
+        For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
+    stated : (lon, lat) or None
+        Its middle by its own georeference.
+    """
+
+    size: tuple[int, int]
+    graph: RoadGraph | None = None
+    xy: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    part: str = ""
+    lines_to_pixels: FloatArray | None = None
+    stated: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, repr=False)
 class Location:
-    """Result of locating one mask.
+    """Result of locating one image.
 
-    Everything that needs a place, but the odds, is None unless `status` is "located", "ambiguous" or "chosen".
+    `place`, and all that is read from it, is None unless `status` is "located", "ambiguous" or "chosen".
 
     Attributes
     ----------
-    attribution : str
-        Whom the licence of the reference asks to name.
-    homography : (3, 3) float64
-        Query pixel (column, row; GDAL corner convention) to CRS.
-    footprint, footprint_lonlat : (4, 2) float64
-        Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
-    fitted : str or None
-        "similarity" where the roads are consistent with a camera that looked straight down, else "homography".
-    corner_sigma_m : (4,) float64
-        Standard deviations of those corners' positions: root mean squares of their distances from the truth.
-    lonlat_accuracy_m : float
-        How exactly PROJ takes the CRS to longitude and latitude here (see `geometry.transformation`): 0 where both have
-        one datum, NaN where it does not know.
-    lens_k1 : float
-        Radial distortion by the lens (see `geometry.lens`), estimated where the mask shows one, else 0. The
-        homography, footprint and corners describe the frame as a pinhole would have seen it.
-    rotation_deg : float
-        Direction of the image's up at its centre, clockwise from true north.
-    tilt_deg : float or None
-        Angle of the camera's axis from the vertical.
-    tilt_source : str or None
-        Origin of the focal length: the given "camera", the "homography" where that determines it, or a usual lens
-        that is "assumed".
-    log10_odds : float or None
-        By how many powers of ten the best place explains more than any other; also where it is not enough to report
-        it. None where no place was verified, or the method knows no odds.
-    reason_code : Reason
-        The reason for programs.
-    corner_covariance_m2 : (8, 8) float64 or None
-        Covariance of the corners' x and y in the CRS: x, y of TL, then of TR, BR, BL.
-    camera : Camera or None
-        Where the camera was; None where no camera above the ground would see the frame so.
-    alternatives : tuple of Place
-        The best other places on any of the references, best first, in the CRS of the best one. Where nothing is
-        located, the best place that there was comes first.
-    stopped : str
-        Why the search ended: "accepted", "exhausted" (nothing was left to try), or at a limit, "work" or "time". Only
-        with "time" may the answer depend on the machine and its load. "" where no search was needed.
-    options : dict or None
-        Options that differ from the defaults, in plain values; None: not recorded.
-    query_to_pixel : (3, 3) float64 or None
-        For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
-    mirrored : bool
-        What was given is mirrored, by the user's or its file's word: the homography mirrors.
-    part_read : str
-        What was read of a file that holds more: "band 2 (road) of 3", "page 1 of 2"; "" where that is all.
-    stated_offset_m : float or None
-        How far the middle lies from where the mask's own georeference puts it; None where it has none.
-    command : str
-        The command line that makes this result again; "" where another program asked.
+    reason : str
+        A sentence; `reason_code` is the same for programs.
+    places : tuple of Placement
+        The best first: the answer's own place, and others. Of a refusal, those that were refused.
+    reference, attribution : str
+        The map that it lies on, or all that were searched in vain, and whom their licences ask to name.
     reference_digest : str
         Digest of the roads of the reference; "" where it has no file.
+    content : Content or None
+        What the image shows; None where it could not be read.
+    options : dict or None
+        Options that differ from the defaults, in plain values; None: not recorded.
+    command : str
+        The command line that makes this result again; "" where another program asked.
     """
 
     query: str
@@ -282,46 +158,13 @@ class Location:
     reason: str
     reference: str = ""
     attribution: str = ""
-    crs: str | None = None
-    size: tuple[int, int] | None = None  # (width, height) of the mask in pixels
-    homography: FloatArray | None = None
-    footprint: FloatArray | None = None
-    footprint_lonlat: FloatArray | None = None
-    center: Place | None = None
-    gsd_m: float | None = None
-    rotation_deg: float | None = None
-    tilt_deg: float | None = None
-    tilt_source: str | None = None
-    fitted: str | None = None
-    lens_k1: float = 0.0
-    corner_sigma_m: FloatArray | None = None
-    lonlat_accuracy_m: float = 0.0
-    n_intersections: int = 0
-    n_matched: int = 0
-    inlier_ratio: float = 0.0
-    log10_odds: float | None = None
-    runner_up: Place | None = None
-    seconds: Seconds = field(default_factory=Seconds)
-    stats: Stats = field(default_factory=Stats)
-    stopped: str = ""
+    places: tuple[Placement, ...] = ()
+    reason_code: Reason = Reason.NOTHING_STANDS_OUT
+    content: Content | None = field(default=None, repr=False)
+    spent: Spent = field(default_factory=Spent)
     options: dict[str, Any] | None = field(default=None, repr=False)
     reference_digest: str = ""
     command: str = field(default="", repr=False)
-    part_read: str = ""
-    stated_offset_m: float | None = None
-    evidence: Evidence | None = None
-    seen: Seen | None = field(default=None, repr=False)
-    reason_code: Reason = Reason.NOTHING_STANDS_OUT
-    corner_covariance_m2: FloatArray | None = field(default=None, repr=False)
-    alternatives: tuple[Place, ...] = ()
-    camera: Camera | None = field(default=None, repr=False)
-    mirrored: bool = False
-    query_to_pixel: FloatArray | None = field(default=None, repr=False)
-
-    @property
-    def center_error(self) -> CenterError | None:
-        """How far the middle may be off; None where that is not known."""
-        return None if self.corner_covariance_m2 is None else CenterError.of(self.corner_covariance_m2)
 
     @property
     def located(self) -> bool:
@@ -334,27 +177,181 @@ class Location:
         return self.status in ("located", "chosen")
 
     @property
-    def places(self) -> tuple[Place, ...]:
-        """All places that are known, the best first."""
-        if self.center is None:
-            return self.alternatives
-        ring = (
-            None if self.footprint_lonlat is None else tuple((lon, lat) for lon, lat in self.footprint_lonlat.tolist())
-        )
-        return (replace(self.center, footprint_lonlat=ring, frame=self), *self.alternatives)
+    def place(self) -> Placement | None:
+        """Where it lies, be it surely or not; None where it was refused."""
+        return self.places[0] if self.places and self.status in ("located", "ambiguous", "chosen") else None
+
+    @property
+    def alternatives(self) -> tuple[Placement, ...]:
+        """The other places, the best first; of a refusal, all that were refused."""
+        return self.places if self.place is None else self.places[1:]
+
+    @property
+    def runner_up(self) -> Placement | None:
+        """The best other place that was compared."""
+        return self.places[0].rival if self.places else None
+
+    def saying(self, more: str) -> Location:
+        """Return it with another clause at the end of its reason."""
+        return replace(self, reason=f"{self.reason}; {more}")
+
+    def spending(self, **seconds: float) -> Location:
+        """Return it with other seconds of some steps."""
+        return replace(self, spent=replace(self.spent, seconds=replace(self.spent.seconds, **seconds)))
+
+    # --- what follows from its place ----------------------------------------------------------------------------------
+
+    @property
+    def crs(self) -> str | None:
+        """See `Placement`, as for all down to `camera`."""
+        return None if self.place is None else self.place.crs
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the image in pixels."""
+        return None if self.content is None else self.content.size
+
+    @property
+    def homography(self) -> FloatArray | None:
+        """Pixel (column, row; GDAL corner convention) to CRS, (3, 3)."""
+        return None if self.place is None else self.place.homography
+
+    @property
+    def footprint(self) -> FloatArray | None:
+        """Corners TL, TR, BR, BL of the frame in the CRS, (4, 2)."""
+        return None if self.place is None else self.place.footprint
+
+    @property
+    def footprint_lonlat(self) -> FloatArray | None:
+        """The same as longitude and latitude."""
+        return None if self.place is None else self.place.footprint_lonlat
+
+    @property
+    def center(self) -> Center | None:
+        """The middle of the frame."""
+        return None if self.place is None else self.place.center
+
+    @property
+    def gsd_m(self) -> float | None:
+        """Metres per pixel at the middle."""
+        return None if self.place is None else self.place.gsd_m
+
+    @property
+    def rotation_deg(self) -> float | None:
+        """Direction of the image's up at its centre, clockwise from true north."""
+        return None if self.place is None else self.place.rotation_deg
+
+    @property
+    def tilt_deg(self) -> float | None:
+        """Angle of the camera's axis from the vertical."""
+        return None if self.place is None else self.place.tilt_deg
+
+    @property
+    def tilt_source(self) -> str | None:
+        """Origin of the focal length."""
+        return None if self.place is None else self.place.tilt_source
+
+    @property
+    def fitted(self) -> str | None:
+        """What the roads are consistent with: "similarity" or "homography"."""
+        return None if self.place is None else self.place.fitted
+
+    @property
+    def lens_k1(self) -> float:
+        """Radial distortion by the lens."""
+        return 0.0 if self.place is None else self.place.lens_k1
+
+    @property
+    def corner_sigma_m(self) -> FloatArray | None:
+        """Standard deviations of the corners' positions, (4,)."""
+        return None if self.place is None else self.place.corner_sigma_m
+
+    @property
+    def corner_covariance_m2(self) -> FloatArray | None:
+        """Covariance of the corners' x and y in the CRS, (8, 8)."""
+        return None if self.place is None else self.place.corner_covariance_m2
+
+    @property
+    def center_error(self) -> CenterError | None:
+        """How far the middle may be off; None where that is not known."""
+        return None if self.place is None else self.place.center_error
 
     @property
     def lonlat_sigma_m(self) -> FloatArray | None:
         """Standard deviations (4,) of the corners' longitude and latitude, in metres; None where they are not known."""
-        if self.corner_sigma_m is None or np.isnan(self.lonlat_accuracy_m):
-            return None
-        return np.hypot(self.corner_sigma_m, self.lonlat_accuracy_m)
+        return None if self.place is None else self.place.lonlat_sigma_m
+
+    @property
+    def lonlat_accuracy_m(self) -> float | None:
+        """How exactly PROJ takes the CRS to longitude and latitude; NaN where it does not know."""
+        return None if self.place is None else self.place.lonlat_accuracy_m
+
+    @property
+    def camera(self) -> Camera | None:
+        """Where the camera was; None where no camera above the ground would see the frame so."""
+        return None if self.place is None else self.place.camera
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the image is mirrored, left to right."""
+        return self.place is not None and self.place.mirrored
+
+    @property
+    def log10_odds(self) -> float | None:
+        """The score: by how many powers of ten the best place explains more than any other, reported or not.
+
+        None where no place was verified, or the method knows no scores.
+        """
+        return self.places[0].score if self.places and not np.isnan(self.places[0].score) else None
 
     @property
     def error_rate(self) -> ErrorRate | None:
         """How often places of such scores were wrong; None where none is reported, or with a lower score than usual."""
         score = self.log10_odds if self.located else None
         return None if score is None else next((rate for rate in reversed(ERROR_RATES) if score >= rate.score), None)
+
+    @cached_property
+    def stated_offset_m(self) -> float | None:
+        """How far the middle lies from where the image's own georeference puts it; None where it has none."""
+        if self.center is None or self.content is None or self.content.stated is None:
+            return None
+        from pyproj import Geod
+
+        return float(Geod(ellps="WGS84").inv(*self.content.stated, self.center.lon, self.center.lat)[2])
+
+    # --- what supports it ---------------------------------------------------------------------------------------------
+
+    @property
+    def seconds(self) -> Seconds:
+        """Wall time of each step."""
+        return self.spent.seconds
+
+    @property
+    def stats(self) -> Stats:
+        """Work done by the search."""
+        return self.spent.stats
+
+    @property
+    def stopped(self) -> str:
+        """Why the search ended (see `Spent`)."""
+        return self.spent.stopped
+
+    @property
+    def n_intersections(self) -> int:
+        """Intersections that the image shows."""
+        return 0 if self.content is None else len(self.content.xy)
+
+    @property
+    def n_matched(self) -> int:
+        """Those that the map has there."""
+        return 0 if self.place is None or self.place.matches is None else len(self.place.matches)
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the image's intersections that the map has there."""
+        return self.n_matched / max(self.n_intersections, 1)
+
+    # --- pixels and ground --------------------------------------------------------------------------------------------
 
     def pixel_to_map(self, pixels: FloatArray) -> FloatArray:
         """Take (..., 2) pixel positions (column, row; the top-left corner is 0, 0) to the location's CRS.
@@ -364,8 +361,7 @@ class Location:
         NotLocatedError
             There is no place: `status` is "not_located".
         """
-        place = self._placed()
-        return place(self._lens.straighten(pixels) if self.lens_k1 else pixels)
+        return self._placed().to_crs(pixels)
 
     def map_to_pixel(self, xy: FloatArray) -> FloatArray:
         """Take (..., 2) coordinates of the location's CRS to pixel positions (column, row).
@@ -375,17 +371,14 @@ class Location:
         NotLocatedError
             There is no place: `status` is "not_located".
         """
-        pixels = self._placed().inverse()(xy)
-        return self._lens.bend(pixels) if self.lens_k1 else pixels
+        return self._placed().to_pixels(xy)
 
-    @property
-    def _lens(self) -> Lens:
-        return Lens.of(self.lens_k1, self.size or (1, 1))
-
-    def _placed(self) -> Homography:
-        if self.homography is None or self.size is None:
+    def _placed(self) -> Placement:
+        if self.place is None:
             raise NotLocatedError(f"{self.query or 'the mask'} has no place: {self.reason}")
-        return Homography(self.homography).facing(Frame(*self.size).center)
+        return self.place
+
+    # --- for other programs -------------------------------------------------------------------------------------------
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -416,7 +409,7 @@ class Location:
         if self.center is None:
             return f"<Location {self.query!r}: {self.status}, {self.reason}>"
         place = f"{self.center.lat:.6f}, {self.center.lon:.6f}" + (f" on {self.reference}" if self.reference else "")
-        score = "" if self.log10_odds is None else f", log10 odds {self.log10_odds:.1f}"
+        score = "" if self.log10_odds is None else f", score {self.log10_odds:.1f}"
         return f"<Location {self.query!r}: {self.status} at {place}{score}>"
 
     def _repr_html_(self) -> str:
@@ -438,44 +431,39 @@ class Location:
         )
         return f"<table><caption>{escape(self.query)}</caption>{cells}</table>"
 
-    def rmse(self) -> tuple[float, float] | None:
-        """Root mean square distance of the matched intersections from where the map has them: metres, pixels."""
-        if self.evidence is None or self.homography is None or not len(self.evidence.query_xy):
-            return None
-        pixels, to_crs = plane_to_pixel(self.evidence.query_xy), Homography(self.homography)
-        pixels = self._lens.straighten(pixels) if self.lens_k1 else pixels
-        errors = (to_crs(pixels) - self.evidence.reference_xy, pixels - to_crs.inverse()(self.evidence.reference_xy))
-        metres, px = (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) for error in errors)
-        return (metres, px) if np.isfinite([metres, px]).all() else None
-
     def to_dict(self) -> dict[str, Any]:
-        """Plain values in the order of the schema, ready for `json.dumps`; without evidence and the mask's contents."""
+        """Plain values in the order of the schema, ready for `json.dumps`; without matches and the image's content."""
+        content, place, crs = self.content, self.place, self.places[0].crs if self.places else ""
 
-        def place(other: Place) -> dict[str, Any]:
-            middle = {"x": other.x, "y": other.y, "lon": other.lon, "lat": other.lat}
-            return {"center": middle, "log10_odds": other.log10_odds}
+        def of_place(other: Placement) -> dict[str, Any]:
+            score = 0.0 if np.isnan(other.score) else other.score
+            return {"center": other.center_in(crs)._asdict(), "log10_odds": score}
 
-        def framed(other: Place) -> dict[str, Any]:
-            ring = other.footprint_lonlat
-            return {**place(other), "footprint_lonlat": None if ring is None else [list(corner) for corner in ring]}
-
-        center, exact = self.center, not np.isnan(self.lonlat_accuracy_m)
+        exact = place is not None and not np.isnan(place.lonlat_accuracy_m)
         made = {
             "schema": SCHEMA,
             "version": __version__,
             "reason_code": self.reason_code.value,
             "reference_digest": self.reference_digest or None,
             "command": self.command or None,
-            "center": None if center is None else place(center)["center"],
-            "lens_k1": None if center is None else self.lens_k1,
-            "lonlat_accuracy_m": self.lonlat_accuracy_m if center is not None and exact else None,
-            **dict(zip(("rmse_m", "rmse_px"), self.rmse() or (None, None), strict=True)),
-            "runner_up": None if self.runner_up is None else place(self.runner_up),
-            "alternatives": [framed(alternative) for alternative in self.alternatives],
+            "center": self.center and self.center._asdict(),
+            "lens_k1": None if place is None else place.lens_k1,
+            "lonlat_accuracy_m": self.lonlat_accuracy_m if exact else None,
+            "query_to_pixel": None if content is None else _plain(content.lines_to_pixels),
+            "part_read": "" if content is None else content.part,
+            **dict(zip(("rmse_m", "rmse_px"), (place and place.rmse()) or (None, None), strict=True)),
+            "runner_up": None if self.runner_up is None else of_place(self.runner_up),
+            "alternatives": [{**of_place(other), **_to_take(other)} for other in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},
             "stats": asdict(self.stats),
         }
         return {name: made[name] if name in made else _plain(getattr(self, name)) for name in _ORDER}
+
+
+def _to_take(place: Placement) -> dict[str, Any]:
+    """Return what it takes to put the image there (see `running.choosing`), as plain values."""
+    names = ("footprint_lonlat", "reference", "attribution", "crs", "homography", "lens_k1", "fitted", "focal_px")
+    return {name: _plain(getattr(place, name)) for name in (*names, "corner_covariance_m2")}
 
 
 #: The keys of `Location.to_dict` in the order in which people read them: the query, the place, its certainty, the cost.

@@ -2,11 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds.answers import placed, sure_to, with_place
 
 from roadgeo.errors import NotLocatedError
-from roadgeo.location import Location, Place
+from roadgeo.location import Content, Location
 
-REFUSED = Location("field.png", "not_located", "only 3 intersections are seen, at least 6 are needed", size=(400, 300))
+REASON = "only 3 intersections are seen, at least 6 are needed"
+REFUSED = Location("field.png", "not_located", REASON, content=Content((400, 300)))
 #: 0.5 m per pixel, north up, and with the sign of w turned about.
 H = -np.array([[0.5, 0.0, 331_000.0], [0.0, -0.5, 4_690_000.0], [0.0, 0.0, 1.0]])
 LOCATED = replace(
@@ -14,32 +16,40 @@ LOCATED = replace(
     status="located",
     reason="40 of 50 intersections agree",
     reference="boston <&>",
-    crs="EPSG:32619",
-    homography=H,
-    footprint=np.array([[331_000, 4_690_000], [331_200, 4_690_000], [331_200, 4_689_850], [331_000, 4_689_850]], float),
-    footprint_lonlat=np.array(
-        [[-71.048806, 42.342935], [-71.046379, 42.342980], [-71.046334, 42.341630], [-71.048761, 42.341585]]
-    ),
-    center=Place(331_100.0, 4_689_925.0, -71.04757, 42.342283, 12.5),
-    gsd_m=0.5,
-    log10_odds=12.5,
-    corner_sigma_m=np.full(4, 0.7),
+    places=(placed(H, "EPSG:32619", score=12.5, corner_covariance_m2=sure_to(*[0.7] * 4)),),
 )
+FOOTPRINT = [[331_000, 4_690_000], [331_200, 4_690_000], [331_200, 4_689_850], [331_000, 4_689_850]]
+
+
+def test_all_follows_from_the_homography():
+    np.testing.assert_allclose(LOCATED.footprint, FOOTPRINT)
+    np.testing.assert_allclose(LOCATED.footprint_lonlat[0], [-71.051672, 42.343911], atol=1e-5)
+    assert LOCATED.center[:2] == (331_100.0, 4_689_925.0)
+    assert (LOCATED.gsd_m, LOCATED.mirrored) == (pytest.approx(0.5), False)
+    assert LOCATED.camera.height_m > 100.0
+    assert REFUSED.place is REFUSED.center is REFUSED.camera is None
+
+
+def lonlat_known_to(metres):
+    location = with_place(LOCATED)
+    vars(location.place)["lonlat_accuracy_m"] = metres
+    return location
 
 
 def test_longitude_and_latitude_are_as_unsure_as_the_way_to_them():
     assert LOCATED.lonlat_sigma_m == pytest.approx(LOCATED.corner_sigma_m)
-    document = replace(LOCATED, lonlat_accuracy_m=2.4).to_dict()
+    document = lonlat_known_to(2.4).to_dict()
     assert document["lonlat_sigma_m"] == pytest.approx([2.5] * 4)
     assert document["corner_sigma_m"] == pytest.approx([0.7] * 4)
     assert document["lonlat_accuracy_m"] == 2.4
-    unknown = replace(LOCATED, lonlat_accuracy_m=np.nan).to_dict()
+    unknown = lonlat_known_to(np.nan).to_dict()
     assert unknown["lonlat_sigma_m"] is unknown["lonlat_accuracy_m"] is None
 
 
 def test_a_location_says_the_answer_in_one_line():
     assert repr(REFUSED) == "<Location 'field.png': not_located, only 3 intersections are seen, at least 6 are needed>"
-    expected = "<Location 'field.png': located at 42.342283, -71.047570 on boston <&>, log10 odds 12.5>"
+    lon, lat = LOCATED.center[2:]
+    expected = f"<Location 'field.png': located at {lat:.6f}, {lon:.6f} on boston <&>, score 12.5>"
     assert repr(LOCATED) == expected
     shown = LOCATED._repr_html_()
     assert "boston &lt;&amp;&gt;" in shown
@@ -51,12 +61,12 @@ def test_a_location_says_the_answer_in_one_line():
     ("location", "score"),
     [
         (LOCATED, 8.0),
-        (replace(LOCATED, log10_odds=3.5), 3.5),
-        (replace(LOCATED, log10_odds=4.99), 3.5),
-        (replace(LOCATED, log10_odds=99.0), 15.0),
-        (replace(LOCATED, log10_odds=3.4), None),  # a lower threshold was asked for: nothing was counted there
+        (with_place(LOCATED, score=3.5), 3.5),
+        (with_place(LOCATED, score=4.99), 3.5),
+        (with_place(LOCATED, score=99.0), 15.0),
+        (with_place(LOCATED, score=3.4), None),  # a lower threshold was asked for: nothing was counted there
         (replace(LOCATED, status="ambiguous"), None),
-        (replace(LOCATED, log10_odds=None), None),
+        (with_place(LOCATED, score=np.nan), None),
         (REFUSED, None),
     ],
 )
@@ -99,9 +109,9 @@ def test_the_middle_is_least_known_along_the_road_that_is_seen(azimuth_deg: floa
     along = np.array([np.sin(np.radians(azimuth_deg)), np.cos(np.radians(azimuth_deg))])
     shift = np.tile(along, 4)  # all corners move together
     covariance = 100.0**2 * np.outer(shift, shift) + 4.0**2 * 4.0 * np.eye(8)
-    error = replace(LOCATED, corner_covariance_m2=covariance).center_error
+    error = with_place(LOCATED, corner_covariance_m2=covariance).center_error
     assert error is not None
     assert error.along_m == pytest.approx(100.0, rel=0.01)
     assert error.across_m == pytest.approx(4.0, rel=0.01)
     assert abs((error.azimuth_deg - azimuth_deg + 90.0) % 180.0 - 90.0) < 0.01
-    assert LOCATED.center_error is None
+    assert with_place(LOCATED, corner_covariance_m2=None).center_error is None

@@ -18,7 +18,7 @@ from typing import Any
 
 import click
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.cli.printing import complain, echo
 from roadgeo.errors import RoadgeoError, name_package
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers

@@ -49,8 +49,9 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, **give
     """
     from roadgeo.cli import NOT_LOCATED
     from roadgeo.errors import NotLocatedError
+    from roadgeo.outputs.location_document import read_location
     from roadgeo.outputs.orthophoto import ImageOptions
-    from roadgeo.running.applying import apply_location, read_location
+    from roadgeo.running.applying import apply_location
 
     try:
         place = read_location(location)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 
 __all__ = ["KEY", "made_by", "said_options"]
 

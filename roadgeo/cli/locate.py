@@ -24,6 +24,7 @@ from roadgeo.cli.options import (
     SEARCH,
     Command,
     Plugin,
+    Read,
     each,
     find_tasks,
     hinted,
@@ -36,7 +37,7 @@ from roadgeo.cli.options import (
 )
 from roadgeo.cli.printing import complain, echo, is_set, paint, tell
 from roadgeo.cli.truths import read_truths
-from roadgeo.matching.hints import HINTS
+from roadgeo.matching.hints import HINTS, read_taken
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -141,9 +142,10 @@ _OPTIONS = (
     row("--truth", "LON,LAT|FILE", RESULTS,
         "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
         rare=True),
-    row("--take", "N", RESULTS,
-        "Where nothing is located: write the N-th of the places that the refusal lists, as chosen by you.",
-        type=click.IntRange(1), rare=True),
+    row("--take taken", "N|LON,LAT", RESULTS,
+        "Write a place that the last answer for the image lists, as chosen by you: the N-th, or the one nearest to"
+        " LON,LAT. Nothing is searched, unless there is no answer yet.",
+        type=Read("place", read_taken), rare=True),
     take("crs", "resolution", "resampling", "compression"),
     row("--max-pixels", "N", RESULTS,
         "Draw coarser rather than more than this.",
@@ -182,7 +184,7 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
     from roadgeo.cli.progress import count_up, show_steps
 
     options = make_options(hinted(given), given["method"])
-    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]), take=given["take"])
+    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
     tasks = find_tasks(masks, given, out_dir)
     cluster = make_cluster(given, jobs)
@@ -200,6 +202,7 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
         exif=given["focal_px"] == "exif",
         dem=given["dem"],
         skip_existing=given["skip_existing"],
+        taken=given["taken"],
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
     opened = open_maps(references, given["near"])

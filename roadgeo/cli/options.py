@@ -470,7 +470,7 @@ def read_options(given: Mapping[str, Any], jobs: int = 1) -> ReadOptions:
 
     from roadgeo.running.options import ReadOptions
 
-    known = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) is not None}
+    known = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) not in (None, ())}
     return ReadOptions(**{**known, "threads": n_threads(jobs)})
 
 

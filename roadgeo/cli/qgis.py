@@ -65,7 +65,7 @@ def package_command(out: str | None, **publisher: str | None) -> None:
       roadgeo qgis package
       roadgeo qgis package --out roadgeo_qgis.zip
     """
-    from roadgeo import __version__
+    from roadgeo._version import __version__
     from roadgeo.qgis.installation import NAME, write_package
 
     path = out or f"{NAME}-{__version__}.zip"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.flights.rows import Row
 from roadgeo.outputs.names import table_cell, table_text
 from roadgeo.storage.files import write_text

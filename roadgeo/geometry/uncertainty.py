@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 
-__all__ = ["CenterError"]
+__all__ = ["CenterError", "corner_sigmas"]
 
 
 class CenterError(NamedTuple):
@@ -35,3 +35,8 @@ class CenterError(NamedTuple):
         east, north = axes[:, 1]
         azimuth = math.degrees(math.atan2(east, north)) % 180.0
         return cls(math.sqrt(max(along, 0.0)), math.sqrt(max(across, 0.0)), azimuth)
+
+
+def corner_sigmas(covariance: FloatArray) -> FloatArray:
+    """Return the standard deviations (4,) of corners from the covariance (8, 8) of their x and y."""
+    return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple, TextIO, TypeVar, cast
 
 import numpy as np
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of, leaves
 from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, writable
 

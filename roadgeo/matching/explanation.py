@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.geometry.camera import CameraFault, CameraOptions, pose
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location

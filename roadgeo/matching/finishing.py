@@ -23,7 +23,6 @@ from roadgeo.matching.refinement import (
     Equations,
     Refined,
     RefineOptions,
-    corner_sigmas,
     refine,
     refine_between,
     weight_on_roads,
@@ -185,7 +184,7 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
     corners = equations.corner_covariance(covariance[:8, :8])
     if not np.isfinite(corners).all():
         return refined
-    return replace(refined, corner_sigma_m=corner_sigmas(corners), corner_covariance_m2=corners)
+    return replace(refined, corner_covariance_m2=corners)
 
 
 def _starts_of_pieces(scene: Scene, which: BoolArray) -> IntArray:

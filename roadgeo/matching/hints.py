@@ -9,14 +9,28 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from roadgeo.geometry.areas import Box, find_area, is_box
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
 
-__all__ = ["HINTS", "Hint", "apply_hints", "read_box", "read_hint", "read_numbers", "read_place", "read_range"]
+__all__ = [
+    "HINTS",
+    "Hint",
+    "Taken",
+    "apply_hints",
+    "read_box",
+    "read_hint",
+    "read_numbers",
+    "read_place",
+    "read_range",
+    "read_taken",
+]
+
+#: A place by its number in an answer's list, from 1, or longitude and latitude near it.
+Taken: TypeAlias = "int | tuple[float, float]"
 
 #: A single pixel size stands for the range from size / factor to size * factor: sizes are seldom known better.
 _GSD_FACTOR = 1.25
@@ -122,6 +136,25 @@ def _read_heading(value: Any) -> tuple[float, float]:
     heading, may_be_off = (*numbers, *read_numbers(off or _HEADING_OFF_DEG, form, (1,)))[:2]
     _expect(-360.0 <= heading <= 360.0 and 0.0 < may_be_off <= 180.0, value, form)
     return heading, may_be_off
+
+
+def read_taken(text: str) -> Taken:
+    """Read which place is taken: its number, or longitude and latitude.
+
+    Raises
+    ------
+    ValueError
+        It is neither.
+    """
+    if re.fullmatch(r"\s*[1-9][0-9]{0,3}\s*", text):
+        return int(text)
+    try:
+        lon, lat = map(float, text.split(","))
+    except ValueError:
+        lon = lat = math.nan
+    if not (-180.0 <= lon <= 180.0 and -90.0 <= lat <= 90.0):
+        raise ValueError(f"got {text!r}, expected the number of a place, from 1, or LON,LAT near it")
+    return lon, lat
 
 
 def read_place(value: Any) -> tuple[float, float, float]:

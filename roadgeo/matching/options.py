@@ -24,8 +24,6 @@ class LocateOptions:
         Circle that is known to contain the middle of the frame.
     min_log10_odds : float
         Score (log10) by which a place must lead any other place to be reported as located.
-    min_margin : float
-        The same, over a place that another variant of the query found.
     truths : tuple of (str, lon, lat)
         For explanations: true middle of the frame of masks whose names end with the text. The search does not use it.
     effort : "quick" or "full"
@@ -33,18 +31,14 @@ class LocateOptions:
         city. "quick": they do not.
     threads : int
         Threads of the search for a mask. The answer does not depend on their number.
-    take : int or None
-        Where nothing is located: the place, counted from 1 among those that the refusal lists, that is the answer.
     """
 
     method: Literal["auto", "pair"] = "auto"
     effort: Literal["quick", "full"] = "full"
     near: tuple[float, float, float] | None = None
     min_log10_odds: float = 3.5
-    min_margin: float = 2.0
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
-    take: int | None = None
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)

@@ -11,6 +11,7 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
+from roadgeo.geometry.uncertainty import corner_sigmas
 from roadgeo.kernels.adjustment import adjust, meet_roads
 from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.roads import road_residuals
@@ -24,7 +25,6 @@ __all__ = [
     "RefineOptions",
     "Refined",
     "between_carriageways",
-    "corner_sigmas",
     "denormalise",
     "nearest_of",
     "normalise",
@@ -90,8 +90,6 @@ class Refined:
     ----------
     matrix : (3, 3) float64
         Query plane to reference plane.
-    corner_sigma_m : (4,) float64
-        Standard deviations of the frame's corners: root mean squares of their distances from the truth.
     rms_m : float
         Robust root mean square of the road points' distances from the map's roads, metres.
     corner_covariance_m2 : (8, 8) float64
@@ -104,12 +102,16 @@ class Refined:
     """
 
     matrix: FloatArray
-    corner_sigma_m: FloatArray
     rms_m: float
     corner_covariance_m2: FloatArray
     lens_k1: float = 0.0
     k1_sigma: float = 0.0
     share: float = 0.0
+
+    @property
+    def corner_sigma_m(self) -> FloatArray:
+        """Standard deviations of the frame's corners: root mean squares of their distances from the truth, (4,)."""
+        return corner_sigmas(self.corner_covariance_m2)
 
 
 def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
@@ -229,7 +231,7 @@ class Equations:
         found = denormalise(self.p[:8], self.scene.center, self.scene.half_size, self._origin, self.unit)
         k1_sigma = math.sqrt(max(float(covariance[8, 8]), 0.0)) if n == 9 else 0.0
         k1, share = float(self.p[8]), used / max(len(self.samples.xy), 1)
-        return Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1, k1_sigma, share)
+        return Refined(found / found[2, 2], rms, corners, k1, k1_sigma, share)
 
     def corner_covariance(self, covariance: FloatArray) -> FloatArray:
         """Return the covariance (8, 8) of the frame's corners, square metres, from the homography's (8, 8)."""
@@ -250,11 +252,6 @@ def _cells(uv: FloatArray) -> IntArray:
     n = _N_CELLS
     columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
     return np.asarray(columns[:, 1] * n + columns[:, 0])
-
-
-def corner_sigmas(covariance: FloatArray) -> FloatArray:
-    """Return the standard deviations (4,) of corners from their covariance (8, 8)."""
-    return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))
 
 
 @lru_cache(maxsize=4)

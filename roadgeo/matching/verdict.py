@@ -9,27 +9,23 @@ from time import perf_counter
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
 from roadgeo._text import counted
 from roadgeo.geometry.camera import CameraOptions, pose
-from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
+from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.geometry.pose import find_pose, turned
-from roadgeo.geometry.projection import from_lonlat, grid_north, to_lonlat
+from roadgeo.geometry.placement import Matches, Placement
 from roadgeo.geometry.similarity import find_similarity
-from roadgeo.geometry.transformation import LONLAT, exactness
-from roadgeo.location import Camera, Evidence, Location, Place, Reason, Seen, Stats
-from roadgeo.matching.estimator import MatchOptions
+from roadgeo.location import Content, Location, Reason, Spent, Stats
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.methods import N_PLACES, Searched
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.place import Place as Hyp
-from roadgeo.matching.refinement import corner_sigmas
-from roadgeo.matching.scene import Query
+from roadgeo.matching.place import Place
+from roadgeo.matching.scene import Query, Scene
 from roadgeo.matching.veto import broken_hints
 
-__all__ = ["center_of", "decide", "place_frame"]
+__all__ = ["decide", "georeference", "match_again", "searched_within"]
 
 
 #: Reason if the clock ended a search: the only case in which an answer depends on the machine and its load.
@@ -46,55 +42,49 @@ _MOST_UNSURE = 0.03
 _LEAST_LOST = 0.02
 
 
-def decide(query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
+def decide(query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
     """Judge the places found on one or more references, and describe the answer."""
     started = perf_counter()
-    location = _judge(query, found, options)
-    seconds = location.seconds
-    return replace(location, seconds=replace(seconds, match=seconds.match + perf_counter() - started))
+    location = _judge(query, searched, options)
+    return location.spending(match=location.seconds.match + perf_counter() - started)
 
 
-def _judge(query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
+def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
     """Compare the places with each other and with the thresholds; describe the best, or the reason for a refusal."""
-    location = _describe_work(query, found)
+    location = _describe_work(query, searched)
     if options.method == "pair":
-        return _decide_pairs(location, query, found, options)
+        return _decide_pairs(location, query, searched, options)
     # The best place of all references, and the others.
-    better = next((one.better for one in found if one.better is not None), None)
-    candidates = [*filter(None, [better]), *_pool(found, options.min_log10_odds)]
-    best, rivals = (candidates[0] if candidates else None), candidates[1:]
-    listed = _listed(found, candidates)
-    places = tuple(_describe(location, query, listed, number, options) for number in range(1, 1 + len(listed)))
-    if best is not None:
-        runner_up = places[1] if rivals else None
-        location = replace(location, log10_odds=best.score, runner_up=runner_up, alternatives=places[1:])
+    better = next((one.better for one in searched if one.better is not None), None)
+    compared = _ranked([place for one in searched for place in one.compared], options.min_log10_odds)
     if better is not None:
-        return _fits_elsewhere(replace(location, log10_odds=None, alternatives=places), candidates, options)
+        return _fits_elsewhere(location, [better, *_listed(searched, compared)][:N_PLACES], options)
+    best, rivals = (compared[0] if compared else None), compared[1:]
     needed = options.min_log10_odds
     rival = None if best is None else _equal(best, rivals, needed)
+    listed = _listed(searched, compared)
     if best is None or (best.score < needed and rival is None):
-        return _refuse(replace(location, alternatives=places), query, found, listed, options)
+        return _refuse(location, query, searched, listed, options)
     best = _against(best, rivals, needed)
-    placed = place_frame(_on(location, best.index), query, best, options.match)
-    cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
+    runner_up = rival or (rivals[0] if rivals else None)
+    location = _at(location, [best, *listed[1:]], runner_up, options)
+    cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.spent.stopped == "time" else ""
     if rival is not None:
-        runner_up = _seen_from(best, rival)
-        placed = replace(placed, runner_up=runner_up)
         reason = _two_places(best, rival) + cut
-        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
-    half = _only_half(placed)
+        return replace(location, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
+    half = _only_half(location.places[0])
     if half:
-        return replace(placed, status="ambiguous", reason=half + cut, reason_code=Reason.HALF_A_PLACE)
+        return replace(location, status="ambiguous", reason=half + cut, reason_code=Reason.HALF_A_PLACE)
     reason = (
-        f"{placed.n_matched} of {placed.n_intersections} intersections and {best.agreement.forward:.0%} of the roads "
-        f"agree; score {best.score:.1f}{cut}"
+        f"{len(location.places[0].matches or ())} of {location.n_intersections} intersections and "
+        f"{best.agreement.forward:.0%} of the roads agree; score {best.score:.1f}{cut}"
     )
-    return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
+    return replace(location, status="located", reason=reason, reason_code=Reason.LOCATED)
 
 
-def _describe_work(query: Query, found: Sequence[Searched]) -> Location:
+def _describe_work(query: Query, searched: Sequence[Searched]) -> Location:
     """Return the fields that do not depend on the answer."""
-    stats = [one.stats for one in found]
+    stats = [one.stats for one in searched]
     work = Stats(
         sum(one.tuples_sampled for one in stats),
         sum(one.candidates for one in stats),
@@ -102,43 +92,43 @@ def _describe_work(query: Query, found: Sequence[Searched]) -> Location:
         sum(one.verified for one in stats),
         sum(one.work_ms for one in stats),
     )
-    match_s, refine_s = sum(one.match_s for one in found), sum(one.refine_s for one in found)
-    xy = query.scene.intersections.xy
-    return Location(
-        query.name,
-        "not_located",
-        "",
-        size=query.scene.size,
-        n_intersections=len(xy),
-        seconds=replace(query.seconds, match=match_s, refine=refine_s),
-        stats=work,
-        stopped=_ended_by(found),
-        seen=Seen(query.graph, xy),
-    )
+    match_s, refine_s = sum(one.match_s for one in searched), sum(one.refine_s for one in searched)
+    seconds = replace(query.seconds, match=match_s, refine=refine_s)
+    content = Content(query.scene.size, query.graph, query.scene.intersections.xy)
+    return Location(query.name, "not_located", "", content=content, spent=Spent(seconds, work, _ended_by(searched)))
 
 
-def _ended_by(found: Sequence[Searched]) -> str:
+def _ended_by(searched: Sequence[Searched]) -> str:
     """Return why a search of one or more parts ended: an answer, a limit, or nothing left to try."""
-    ends = {one.stopped for one in found}
+    ends = {one.stopped for one in searched}
     return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
 
-def _on(location: Location, index: ReferenceIndex) -> Location:
-    """Name the reference of an answer."""
-    return replace(location, reference=index.name, attribution=str(index.meta.get("attribution") or ""))
+def _at(location: Location, places: Sequence[Place], rival: Place | None, options: LocateOptions) -> Location:
+    """Return an answer with its places, the first of which has this rival, and the map of the first."""
+    focal_px = options.match.camera.focal_px
+    best, *others = (georeference(place, focal_px) for place in places)
+    beaten = None if rival is None else next((k for k, place in enumerate(places) if _is_at(place, rival)), None)
+    if rival is not None:
+        best = replace(best, rival=georeference(rival, focal_px) if not beaten else others[beaten - 1])
+    return replace(location, places=(best, *others), reference=best.reference, attribution=best.attribution)
 
 
-def _pool(found: Sequence[Searched], needed: float) -> list[Hyp]:
+def _is_at(place: Place, other: Place) -> bool:
+    """Return whether two values are of one homography."""
+    return place.matrix is other.matrix
+
+
+def _ranked(pool: Sequence[Place], needed: float) -> list[Place]:
     """Return the places of all references, the best first; a place on overlapping parts occurs once.
 
     Leads compete: a place that leads its own map comes before all that do not. Those that do are ranked by likelihood.
     """
-    pool = [place for one in found for place in one.compared]
     leading = _distinct([place for place in pool if place.score >= needed])
     return leading + _distinct([place for place in pool if place.score < needed], leading)
 
 
-def _distinct(pool: Sequence[Hyp], known: Sequence[Hyp] = ()) -> list[Hyp]:
+def _distinct(pool: Sequence[Place], known: Sequence[Place] = ()) -> list[Place]:
     """Return the places that are not known, the best first, each once; places of one search are different."""
     distinct = list(known)
     for place in sorted(pool, key=lambda one: (-one.explained, -one.score)):
@@ -147,43 +137,22 @@ def _distinct(pool: Sequence[Hyp], known: Sequence[Hyp] = ()) -> list[Hyp]:
     return distinct[len(known) :]
 
 
-def _listed(found: Sequence[Searched], candidates: Sequence[Hyp]) -> list[Hyp]:
-    """Return the places that an answer lists: the candidates, then others that were verified."""
-    if not candidates:
+def _listed(searched: Sequence[Searched], compared: Sequence[Place]) -> list[Place]:
+    """Return the places that an answer lists: those that were compared, then others that were verified."""
+    if not compared:
         return []
-    further = _distinct([place for one in found for place in one.places[1:]], candidates)
-    return [*candidates, *further][:N_PLACES]
+    further = _distinct([place for one in searched for place in one.places[1:]], compared)
+    return [*compared, *further][:N_PLACES]
 
 
-def _describe(location: Location, query: Query, listed: Sequence[Hyp], number: int, options: LocateOptions) -> Place:
-    """Describe the listed place of this number, from 1, with its footprint; whole, if it may be taken."""
-    one = listed[number - 1]
-    corners = Homography(one.matrix @ PIXEL_TO_PLANE).everywhere(Frame(*query.scene.size).corners)
-    plane, frame = one.index.plane, None
-    ring = tuple((lon, lat) for lon, lat in to_lonlat(plane.crs, plane.to_crs(corners)).tolist())
-    if options.take is not None and number <= options.take:
-        frame = place_frame(_on(location, one.index), query, one, options.match)
-    return replace(_seen_from(listed[0], one), footprint_lonlat=ring, frame=frame)
-
-
-def _seen_from(best: Hyp, rival: Hyp) -> Place:
-    """Return the middle of a rival in the CRS of the best place."""
-    center = center_of(rival)
-    if best.index.is_of_map(rival.index):
-        return center
-    plane = best.index.plane
-    x, y = plane.to_crs(from_lonlat(plane, rival.lonlat[None]))[0]
-    return replace(center, x=float(x), y=float(y))
-
-
-def _against(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp:
+def _against(best: Place, rivals: Sequence[Place], needed: float) -> Place:
     """Return a place with its lead over the places on all references that lead their own."""
     others = [one for one in rivals if one.index is not best.index and one.score >= needed]
     leads = [best.explained - one.explained for one in others]
     return best.but(score=min([best.score, *(lead / best.statement_px for lead in leads)]))
 
 
-def _equal(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp | None:
+def _equal(best: Place, rivals: Sequence[Place], needed: float) -> Place | None:
     """Return a rival that makes the best place ambiguous, or None.
 
     If no place would be reported, that is a rival that agrees as well as the best place where streets repeat. Otherwise
@@ -194,27 +163,24 @@ def _equal(best: Hyp, rivals: Sequence[Hyp], needed: float) -> Hyp | None:
     return next((one for one in rivals if _against(best, [one], needed).score < needed), None)
 
 
-def _are_alike(best: Hyp, rival: Hyp) -> bool:
+def _are_alike(best: Place, rival: Place) -> bool:
     """Return whether both places agree so well that only repeating streets explain it, whatever their scores."""
     return min(best.agreeing, rival.agreeing) >= _LIKE_THE_TRUTH
 
 
-def _only_half(placed: Location) -> str:
+def _only_half(placed: Placement) -> str:
     """Describe a place whose middle is uncertain by much of the frame; "" for a whole place."""
-    error = placed.center_error
-    if error is None or placed.gsd_m is None or placed.size is None:
-        return ""
-    side_m = placed.gsd_m * math.sqrt(placed.size[0] * placed.size[1])
-    if error.along_m <= _MOST_UNSURE * side_m:
+    error, side_m = placed.center_error, placed.gsd_m * math.sqrt(placed.size[0] * placed.size[1])
+    if error is None or error.along_m <= _MOST_UNSURE * side_m:
         return ""
     return (
-        f"only half a place is known: the middle lies within +-{2.0 * error.along_m:.0f} m along "
-        f"{error.azimuth_deg:.0f} degrees from north and +-{2.0 * error.across_m:.0f} m across (95 %), of a frame of "
-        f"{side_m:.0f} m; roads in other directions would tell the rest"
+        f"position is uncertain along one direction: +-{2.0 * error.along_m:.0f} m at azimuth "
+        f"{error.azimuth_deg:.0f} degrees, +-{2.0 * error.across_m:.0f} m across (95 %), of a frame of {side_m:.0f} m; "
+        "roads in other directions would fix it"
     )
 
 
-def _two_places(best: Hyp, rival: Hyp) -> str:
+def _two_places(best: Place, rival: Place) -> str:
     on = ("", "")
     if best.index.name != rival.index.name:
         on = (f" on {best.index.name}", f" on {rival.index.name}")
@@ -224,84 +190,92 @@ def _two_places(best: Hyp, rival: Hyp) -> str:
     )
 
 
-def _decide_pairs(location: Location, query: Query, found: Sequence[Searched], options: LocateOptions) -> Location:
+def _decide_pairs(location: Location, query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
     """Report the place that the paper's method found; the method has no scores."""
-    best = next((one for one in found if one.places), None)
+    best = next((one for one in searched if one.places), None)
     if best is None:
-        return _refuse(location, query, found, [], options)
-    placed = place_frame(_on(location, best.index), query, best.places[0], options.match)
-    return replace(placed, status="located", reason=best.said, reason_code=Reason.LOCATED)
+        return _refuse(location, query, searched, [], options)
+    location = _at(location, best.places[:1], None, options)
+    return replace(location, status="located", reason=best.said, reason_code=Reason.LOCATED)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def _refuse(
-    location: Location, query: Query, found: Sequence[Searched], listed: Sequence[Hyp], options: LocateOptions
+    location: Location, query: Query, searched: Sequence[Searched], listed: Sequence[Place], options: LocateOptions
 ) -> Location:
     """Describe why nothing is reported, for the reference that came nearest."""
-    nearest = next((one for one in found if listed and listed[0].index.is_of_map(one.index)), None)
-    nearest = nearest or max(found, key=lambda one: one.n_tried)
+    nearest = next((one for one in searched if listed and listed[0].index.is_of_map(one.index)), None)
+    nearest = nearest or max(searched, key=lambda one: one.n_tried)
     code, reason = _why_nothing(query, nearest, listed, options)
-    location = replace(location, reason_code=code)
-    distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
-    if len(distinct) == 1:
-        return replace(_on(location, nearest.index), reason=reason)
-    names = ", ".join(distinct)
-    owed = dict.fromkeys(_on(location, one.index).attribution for one in found)
-    cut_short = {one.index.name for one in found if one.stopped != "exhausted"}
-    done = f"{len(distinct) - len(cut_short)} of {len(distinct)} maps searched to the end"
+    if listed:
+        runner_up = next((place for place in listed[1:] if _was_compared(place, searched)), None)
+        location = _at(location, listed, runner_up, options)
+    names = list(dict.fromkeys(one.index.name for one in searched))  # shards bear the name of their map
+    owed = dict.fromkeys(str(one.index.meta.get("attribution") or "") for one in searched)
+    if len(names) > 1:
+        n_ended = len(names) - len({one.index.name for one in searched if one.stopped != "exhausted"})
+        done = f"{n_ended} of {len(names)} maps searched to the end"
+        reason = f"{reason} (looked on {', '.join(names)}; {done})"
     return replace(
         location,
-        reference=names,
+        reference=", ".join(names),
         attribution="; ".join(filter(None, owed)),
-        reason=f"{reason} (looked on {names}; {done})",
+        reason=reason,
+        reason_code=code,
     )
 
 
-def _fits_elsewhere(location: Location, candidates: Sequence[Hyp], options: LocateOptions) -> Location:
-    """Refuse what hints led to: the first of the candidates, which they exclude, explains more."""
-    better, *told = candidates
-    away_m = better.apart_m(told[0]) if told else None
+def _fits_elsewhere(location: Location, listed: Sequence[Place], options: LocateOptions) -> Location:
+    """Refuse what hints led to: the first of the places, which they exclude, explains more."""
+    better, *told = listed
+    where = f"{_away(better.apart_m(told[0]))} away" if told else "elsewhere"
     ways = broken_hints(better, options)
-    where = "elsewhere" if away_m is None else _away(away_m)
     reason = f"the roads fit better {where}, {', and '.join(ways)}" if ways else f"the roads fit better {where}"
-    return replace(_on(location, better.index), reason=reason, reason_code=Reason.FITS_ELSEWHERE)
+    return replace(_at(location, listed, None, options), reason=reason, reason_code=Reason.FITS_ELSEWHERE)
 
 
-def _away(away_m: float) -> str:
+def _away(metres: float) -> str:
     """Say how far, in metres or kilometres."""
-    return f"{away_m:.0f} m away" if away_m < 1000.0 else f"{away_m / 1000.0:.1f} km away"
+    return f"{metres:.0f} m" if metres < 1000.0 else f"{metres / 1000.0:.1f} km"
 
 
-def _why_nothing(query: Query, found: Searched, listed: Sequence[Hyp], options: LocateOptions) -> tuple[Reason, str]:
+def _was_compared(place: Place, searched: Sequence[Searched]) -> bool:
+    """Return whether an answer rests on a place; others are only listed."""
+    return any(_is_at(place, other) for one in searched for other in one.compared)
+
+
+def _why_nothing(
+    query: Query, nearest: Searched, listed: Sequence[Place], options: LocateOptions
+) -> tuple[Reason, str]:
     """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
         return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
-    if found.said:
-        return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
-    searched = searched_within(options)
-    if found.n_searched == 0 and (options.near is not None or options.match.within is not None):
+    if nearest.said:
+        return Reason.TIME_LIMIT if nearest.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, nearest.said
+    within = searched_within(options)
+    if nearest.n_searched == 0 and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
-        return Reason.FEW_NEAR, f"the map has {counted(found.n_searched, 'intersection')} {given}{searched}"
+        return Reason.FEW_NEAR, f"the map has {counted(nearest.n_searched, 'intersection')} {given}{within}"
     score = listed[0].score if listed else -math.inf
     best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
-    if found.stopped == "work":
-        told = f"stopped after as much work as a search may take; of the places tried, {best}{searched}"
-        return Reason.TIME_LIMIT, f"{told}; {_how_far(query, found, options)}"
-    if found.stopped == "time":
+    if nearest.stopped == "work":
+        told = f"stopped after as much work as a search may take; of the places tried, {best}{within}"
+        return Reason.TIME_LIMIT, f"{told}; {_how_far(query, nearest, options)}"
+    if nearest.stopped == "time":
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
         stopped = f"stopped at the time limit of {limit:g} s{tracing}, {_CUT_SHORT}"
-        told = f"{stopped}; of the places tried, {best}{searched}; {_how_far(query, found, options)}"
+        told = f"{stopped}; of the places tried, {best}{within}; {_how_far(query, nearest, options)}"
         return Reason.TIME_LIMIT, told
     return (
         Reason.NOTHING_STANDS_OUT,
-        f"no place on this map stands out: {best}{searched}; {_what_may_help(query, listed, options)}",
+        f"no place on this map stands out: {best}{within}; {_what_may_help(query, listed, options)}",
     )
 
 
-def _what_may_help(query: Query, listed: Sequence[Hyp], options: LocateOptions) -> str:
+def _what_may_help(query: Query, listed: Sequence[Place], options: LocateOptions) -> str:
     """List what may decide: more to see, and the missing hints, with the number of listed places that each leaves."""
     camera, usual = options.match.camera, CameraOptions()
     views = [pose(one.matrix, query.scene.size) for one in listed]
@@ -330,9 +304,9 @@ def _lead(score: float, needed: float) -> str:
     return f"the best has a score of {math.floor(10.0 * score) / 10.0:g}, {needed:g} is asked for"
 
 
-def _how_far(query: Query, found: Searched, options: LocateOptions) -> str:
+def _how_far(query: Query, searched: Searched, options: LocateOptions) -> str:
     """Describe the progress of a search that was cut short, and hints that would shorten it."""
-    far = f"{found.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
+    far = f"{searched.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
     (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
     if (low, high) == usual:
         share = 2.0 * math.log(1.3) / math.log(high / low)
@@ -367,92 +341,55 @@ def searched_within(options: LocateOptions) -> str:
     return f"; searched {', '.join(limits)}" if limits else ""
 
 
-# --- where the frame lies on Earth, and how it was seen ---------------------------------------------------------------
+# --- where the frame lies on Earth ------------------------------------------------------------------------------------
 
 
-def place_frame(location: Location, query: Query, fit: Hyp, options: MatchOptions) -> Location:
-    """Fill in everything that follows from a fit's homography and its matches."""
-    # The corners and the middle in the map's CRS.
-    plane, scene = fit.index.plane, query.scene
-    frame = Frame(*scene.size)
-    level = _level(fit, query)
-    homography = plane.to_crs_matrix() @ level.matrix @ PIXEL_TO_PLANE
-    ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
-    lonlat = to_lonlat(plane.crs, ground)
-    # The view of the camera, and the intersections that support it.
-    focal_px = options.camera.focal_px
-    camera = pose(level.matrix, scene.size, focal_px)
-    north = grid_north(plane, ground[4])
-    chosen = fit.matched >= 0
-    reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
-    # The camera's covariance comes from all eight parameters: the pose of a camera that looks straight down has six.
-    seat = _find_camera(fit, level.matrix, scene.size, focal_px, north)
-    odds = 0.0 if math.isnan(fit.score) else fit.score
-    return replace(
-        location,
-        crs=plane.crs,
-        homography=homography / homography[2, 2],
-        footprint=ground[:4],
-        footprint_lonlat=lonlat[:4],
-        center=_place(ground[4], lonlat[4], odds),
-        fitted="homography" if level is fit else "similarity",
-        lens_k1=fit.lens_k1,
-        corner_sigma_m=None if level.covariance is None else corner_sigmas(level.covariance),
-        corner_covariance_m2=level.covariance,
-        lonlat_accuracy_m=exactness(plane.crs, LONLAT, lonlat[4].tolist()).sigma_m,
-        gsd_m=camera.gsd_m,
-        rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
-        tilt_deg=camera.tilt_deg if seat is None else seat.tilt_deg,
-        tilt_source=camera.source if seat is None else seat.source,
-        n_matched=int(chosen.sum()),
-        inlier_ratio=float(chosen.mean()),
-        log10_odds=None if math.isnan(fit.score) else fit.score,
-        camera=seat,
-        evidence=Evidence(query.graph, scene.intersections.xy[chosen], reference_xy, fit.matches[1][chosen]),
+def georeference(place: Place, focal_px: float | None = None) -> Placement:
+    """Return a place as it leaves: in the map's CRS, levelled where the camera looked straight down.
+
+    `focal_px`: the camera's focal length, where it is given.
+    """
+    index, level = place.index, _level(place)
+    return Placement(
+        place.scene.size,
+        index.plane,
+        level.matrix @ PIXEL_TO_PLANE,
+        place.score,
+        index.name,
+        str(index.meta.get("attribution") or ""),
+        level.covariance,
+        place.lens_k1,
+        "homography" if level is place else "similarity",
+        focal_px,
+        matches=_matches(place),
     )
 
 
-def _level(fit: Hyp, query: Query) -> Hyp:
-    """Return a fit restricted to a camera that looks straight down, unless the roads are inconsistent with it."""
-    if fit.refined is None or fit.lens_k1:
-        return fit
-    scene = query.scene
-    found = find_similarity(fit.matrix, scene.corners, fit.refined.corner_covariance_m2)
-    if found is None:
-        return fit
-    matrix, covariance = found.matrix, found.corner_covariance + found.doubt
+def match_again(placement: Placement, scene: Scene, index: ReferenceIndex) -> Matches:
+    """Return the intersections of a scene that match a map's where it was placed; both are in one CRS."""
+    to_plane = shift(*np.subtract(placement.plane.origin, index.plane.origin))
+    straight = straighten_scene(scene, placement.lens_k1) if placement.lens_k1 else scene
+    return _matches(Place(straight, index, to_plane @ placement.matrix @ PIXEL_TO_PLANE), placement.lens_k1)
+
+
+def _matches(place: Place, lens_k1: float = 0.0) -> Matches:
+    """Return the intersections that match at a place, the query's as the lens shows them."""
+    index, scene, chosen = place.index, place.scene, place.matched >= 0
+    query_xy, there = scene.intersections.xy[chosen], index.xy[place.matched[chosen]]
+    residual_m = np.hypot(*(Homography(place.matrix).everywhere(query_xy) - there).T)
+    k1 = lens_k1 or place.lens_k1
+    bent = Lens.of(k1, scene.size, y_up=True).bend(query_xy) if k1 else query_xy
+    return Matches(bent, index.plane.to_crs(there), residual_m)
+
+
+def _level(place: Place) -> Place:
+    """Return a place restricted to a camera that looks straight down, unless the roads are inconsistent with it."""
+    if place.refined is None or place.lens_k1:
+        return place
+    level = find_similarity(place.matrix, place.scene.corners, place.refined.corner_covariance_m2)
+    if level is None:
+        return place
     # The covariance may be too large. Roads that agreed must still agree.
-    sigmas = corner_sigmas(covariance)
-    refined = replace(fit.refined, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=sigmas)
-    level = replace(fit, matrix=matrix, refined=refined)
-    return level if level.agreement.forward >= fit.agreement.forward - _LEAST_LOST else fit
-
-
-def _find_camera(
-    fit: Hyp, matrix: FloatArray, size: tuple[int, int], focal_px: float | None, north: float
-) -> Camera | None:
-    """Return the camera of a fit's `matrix`, levelled or not.
-
-    `north` is the direction of the plane's y axis from true north.
-    """
-    if fit.covariance is None:
-        return None
-    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.covariance, focal_px)
-    if found is None:
-        return None
-    plane, rotation = fit.index.plane, turned(found.rotation, -north)
-    x, y = plane.to_crs(found.position[:2]).tolist()
-    lon, lat = to_lonlat(plane.crs, np.array([[x, y]]))[0].tolist()
-    heading, pitch, roll = replace(found, rotation=rotation).angles_deg.tolist()
-    height = float(found.position[2])
-    lens = (found.focal_px, found.focal_sigma_px, found.source)
-    return Camera(x, y, lon, lat, height, heading, pitch, roll, *lens, found.covariance, rotation)
-
-
-def center_of(place: Hyp) -> Place:
-    """Return the middle of the frame as a place."""
-    return _place(place.index.plane.to_crs(place.center), place.lonlat, place.score)
-
-
-def _place(xy: FloatArray, lonlat: FloatArray, log10_odds: float) -> Place:
-    return Place(float(xy[0]), float(xy[1]), float(lonlat[0]), float(lonlat[1]), log10_odds)
+    refined = replace(place.refined, matrix=level.matrix, corner_covariance_m2=level.corner_covariance + level.doubt)
+    levelled = place.at(refined)
+    return levelled if levelled.agreement.forward >= place.agreement.forward - _LEAST_LOST else place

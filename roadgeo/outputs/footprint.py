@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import AnyArray
+from roadgeo._version import __version__
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.warping import warp
 from roadgeo.outputs.drawing.layers import rgb

@@ -15,6 +15,7 @@ from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import mask_picture
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
+from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.subject import Subject
 
 __all__ = ["write_kmz"]
@@ -45,7 +46,7 @@ def _draw_in_degrees(subject: Subject) -> tuple[bytes, MapGrid]:
     middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
     _, *ways = choose_target(place, ImageOptions(crs))
-    warped, grid = place.draw(image, subject.mask.shape[::-1], _PIXELS, ways)
+    warped, grid = warp_picture(place, image, subject.mask.shape[::-1], _PIXELS, ways)
     return encode(warped, ".png"), grid
 
 

@@ -125,7 +125,7 @@ def write_location(
             removed = list(_remove(_stale(subject, wanted, options.products)))
             if photo is not None:  # an earlier mask's style would colour the photograph
                 removed += _remove([paths.of(STYLE)])
-            location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
+            location = location.spending(write=perf_counter() - started)
             write_json(report, replace(subject, location=location))
     except (CrsError, MaskError) as error:
         outdated = {*REGISTRY.values(), *wanted} - {JSON}

@@ -9,11 +9,13 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.mask import plane_to_pixel
-from roadgeo.location import Evidence, Location
+from roadgeo.geometry.placement import Matches, Placement
+from roadgeo.location import Location
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.drawing.layers import rgb
-from roadgeo.outputs.paths import Placement
+from roadgeo.outputs.placing import map_roads
 from roadgeo.outputs.subject import Subject
+from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.geopackage import Layer, dump_layers
 from roadgeo.storage.qml import draw_arrow, draw_fill, draw_line, draw_marker
 
@@ -39,23 +41,23 @@ def write_geopackage(path: Path, subject: Subject) -> None:
 
 
 def _layers(subject: Subject) -> list[Layer]:
-    place, evidence = subject.place, subject.location.evidence
+    place, matches = subject.place, subject.place.matches
     columns = {name: [value] for name, value in attributes(subject.location.to_dict()).items()}
     text = "Ground that the image shows"
     return [
         Layer("footprint", "POLYGON", [place.footprint], columns, place.crs, _FOOTPRINT_STYLE, text),
-        *([] if evidence is None else _evidence_layers(place, evidence)),
-        _corner_layer(place, subject.location),
+        *([] if matches is None else _match_layers(place, subject.graph, matches)),
+        _corner_layer(place),
         _alternative_layer(place, subject.location),
     ]
 
 
-def _evidence_layers(place: Placement, evidence: Evidence) -> list[Layer]:
+def _match_layers(place: Placement, graph: RoadGraph, matches: Matches) -> list[Layer]:
     """Draw the mask's roads on the map, its matched intersections where the map has them, and the way between both."""
-    lines, pixels = place.map_roads(evidence.query_graph), plane_to_pixel(evidence.query_xy)
-    start, end = place.to_crs(pixels), evidence.reference_xy
+    lines, pixels = map_roads(place, graph), plane_to_pixel(matches.query_xy)
+    start, end = place.to_crs(pixels), matches.reference_xy
     arrows = list(np.stack([start, start + _EXAGGERATION * (end - start)], axis=1))
-    apart = {"residual_m": evidence.residual_m, "dx_m": end[:, 0] - start[:, 0], "dy_m": end[:, 1] - start[:, 1]}
+    apart = {"residual_m": matches.residual_m, "dx_m": end[:, 0] - start[:, 0], "dy_m": end[:, 1] - start[:, 1]}
     where = {"column": pixels[:, 0], "row": pixels[:, 1]}
     texts = (
         "Roads of the mask, as vectorized",
@@ -80,9 +82,9 @@ def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(np.add.reduceat(steps, starts[:-1]))
 
 
-def _corner_layer(place: Placement, location: Location) -> Layer:
+def _corner_layer(place: Placement) -> Layer:
     """Show the corners of the frame, each with the covariance of its position."""
-    sigma, covariance = location.corner_sigma_m, location.corner_covariance_m2
+    sigma, covariance = place.corner_sigma_m, place.corner_covariance_m2
     covariance = np.full((8, 8), np.nan) if covariance is None else covariance
     columns = {
         "corner": list(_CORNERS),
@@ -98,9 +100,8 @@ def _corner_layer(place: Placement, location: Location) -> Layer:
 def _alternative_layer(place: Placement, location: Location) -> Layer:
     """Show where else the mask might lie."""
     others = location.alternatives
-    values = np.array([(other.x, other.y, other.log10_odds, other.lon, other.lat) for other in others], float)
-    values = values.reshape(-1, 5)
-    columns = dict(zip(("log10_odds", "lon", "lat"), values.T[2:], strict=True))
+    values = np.array([(*other.center_in(place.crs), other.score) for other in others], float).reshape(-1, 5)
+    columns = dict(zip(("lon", "lat", "log10_odds"), values.T[2:], strict=True))
     columns = {"rank": np.arange(2, 2 + len(others)), **columns}
-    text = "Middles of the best other places, with their odds"
+    text = "Middles of the best other places, with their scores"
     return Layer("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)

@@ -24,9 +24,9 @@ from rasterio.windows import Window
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
+from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import transform
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
-from roadgeo.outputs.paths import Placement
 from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import UPRIGHT, read_orientation
 from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster

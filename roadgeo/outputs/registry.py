@@ -13,12 +13,9 @@ import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from roadgeo.errors import PluginError
-
-if TYPE_CHECKING:
-    from roadgeo.outputs.subject import Subject
 
 __all__ = [
     "ALSO",
@@ -61,7 +58,7 @@ class Output:
 
     name: str
     ending: str
-    write: Callable[[Path, Subject], None]
+    write: Callable[[Path, Any], None]  # of a `Subject`, which knows the outputs
     summary: str
     needs_place: bool = True
     option: str = ""
@@ -80,7 +77,7 @@ def _own(name: str, ending: str, writer: str, summary: str, **more: Any) -> Outp
     """Return an output of this package; `writer` is "module.function", imported when something is written."""
     module, _, function = writer.rpartition(".")
 
-    def write(path: Path, subject: Subject) -> None:
+    def write(path: Path, subject: Any) -> None:
         getattr(importlib.import_module(f"roadgeo.outputs.{module}"), function)(path, subject)
 
     return Output(name, ending, write, summary, **more)

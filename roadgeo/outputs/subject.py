@@ -15,15 +15,18 @@ from roadgeo.errors import CrsError, OutputError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.geometry.placement import Matches, Placement
 from roadgeo.geometry.warping import MapGrid, cover
-from roadgeo.location import Evidence, Location, Seen
+from roadgeo.location import Content, Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.drawing.layers import Box
 from roadgeo.outputs.drawing.svg import thin_lines
 from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography, read_preview
-from roadgeo.outputs.paths import OutputPaths, Placement
+from roadgeo.outputs.paths import OutputPaths
+from roadgeo.outputs.placing import placement_of
+from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
 __all__ = ["Match", "Subject", "ViewOptions"]
@@ -144,12 +147,12 @@ class Subject:
     @property
     def has_place(self) -> bool:
         """Whether it lies anywhere, be it surely or not."""
-        return self.location.homography is not None
+        return self.location.place is not None
 
     @cached_property
     def place(self) -> Placement:
         """Where it lies."""
-        return Placement.of(self.location)
+        return placement_of(self.location)
 
     @cached_property
     def _registered(self) -> tuple[FloatArray, tuple[int, int]]:
@@ -188,12 +191,18 @@ class Subject:
         return None if self.photo is None else read_preview(self.photo, self.views.picture_px)
 
     @cached_property
-    def _seen(self) -> Seen:
-        """The mask's roads and intersections, traced again where they are not known."""
-        if self.location.seen is not None:
-            return self.location.seen
+    def _content(self) -> Content:
+        """The mask's roads and intersections, traced again where they are not at hand."""
+        if self.location.content is not None and self.location.content.graph is not None:
+            return self.location.content
         scene, graph = trace_query(self.mask)
-        return Seen(graph, scene.intersections.xy)
+        return Content(scene.size, graph, scene.intersections.xy)
+
+    @property
+    def graph(self) -> RoadGraph:
+        """The mask's roads, query plane."""
+        assert self._content.graph is not None  # noqa: S101 - it was traced
+        return self._content.graph
 
     @cached_property
     def lines(self) -> list[FloatArray]:
@@ -204,28 +213,29 @@ class Subject:
         MaskError
             It shows none.
         """
-        lines = [plane_to_pixel(line) for line in self._seen.graph.polylines()]
+        lines = [plane_to_pixel(line) for line in self.graph.polylines()]
         return thin_lines(lines, self.views.max_query_vertices, 0.4)
 
     @property
     def crossings(self) -> FloatArray:
         """(N, 2) intersections of the mask, pixels."""
-        return plane_to_pixel(self._seen.xy)
+        return plane_to_pixel(self._content.xy)
 
-    def largest_residuals(self) -> Evidence | None:
+    def largest_residuals(self) -> Matches | None:
         """Return the matches with the largest residuals, in falling order, as many as views show."""
-        evidence = self.location.evidence
-        if evidence is None:
+        matches = None if self.location.place is None else self.location.place.matches
+        if matches is None:
             return None
-        first = np.argsort(-evidence.residual_m, kind="stable")[: self.views.max_matches]
-        picked = (evidence.query_xy[first], evidence.reference_xy[first], evidence.residual_m[first])
-        return Evidence(evidence.query_graph, *picked)
+        first = np.argsort(-matches.residual_m, kind="stable")[: self.views.max_matches]
+        return Matches(matches.query_xy[first], matches.reference_xy[first], matches.residual_m[first])
 
     def runner_up(self) -> FloatArray | None:
         """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
         location = self.location
         other = location.runner_up if self.has_place else next(iter(location.alternatives), None)
-        return None if other is None else np.array([other.x, other.y])
+        if other is None:
+            return None
+        return np.array(other.center_in(self.location.crs or other.crs)[:2])
 
     @cached_property
     def target(self) -> Target:
@@ -278,17 +288,17 @@ class Subject:
         OutputError
             There is no place, or its map is not at hand.
         """
-        evidence, place = self.location.evidence, self.place
-        if evidence is None:
+        place, matches = self.place, self.place.matches
+        if matches is None:
             raise OutputError(f"{self.location.query}: its matched intersections are not known any more")
         to_map, to_picture = Homography(self.homography), Homography(self.homography).inverse()
-        found = place.to_crs(plane_to_pixel(evidence.query_xy))
+        mapped = place.to_crs(plane_to_pixel(matches.query_xy))
         lens = place.lens(self.size)
-        straight = to_picture(found)  # the picture's, which may be larger than the mask
-        fitted = to_picture(evidence.reference_xy)
-        offset = evidence.reference_xy - to_map(straight)
+        straight = to_picture(mapped)  # the picture's, which may be larger than the mask
+        fitted = to_picture(matches.reference_xy)
+        offset = matches.reference_xy - to_map(straight)
         pixels, fitted = (straight, fitted) if lens is None else (lens.bend(straight), lens.bend(fitted))
-        return [Match(*row) for row in np.hstack([pixels, evidence.reference_xy, fitted, offset]).tolist()]
+        return [Match(*row) for row in np.hstack([pixels, matches.reference_xy, fitted, offset]).tolist()]
 
     def outline(self) -> FloatArray:
         """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""

@@ -40,8 +40,8 @@ from typing import Any, NoReturn, TypeGuard
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import AnyArray
+from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError, RoadgeoError
 from roadgeo.reference.plain_values import MAX_PICKLE, dump_plain, load_plain, require_plain
 

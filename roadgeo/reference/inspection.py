@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.errors import CrsError, IndexFormatError, RoadSourceError
 from roadgeo.matching.index import ReferenceIndex, build_index, check_table
 from roadgeo.reference import files

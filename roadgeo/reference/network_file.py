@@ -21,9 +21,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo._progress import Say, say_nothing
+from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.projection import LocalPlane

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.areas import Box, overlap
 from roadgeo.location import Location

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -82,6 +82,27 @@ class Answer(Location):
         if written.faults:
             raise PluginError("; ".join(written.faults))
         return written.files
+
+    def take(self, place: int | tuple[float, float]) -> Answer:
+        """Return the answer with one of its `places` as the one that you take; nothing is searched again.
+
+        >>> refused = roadgeo.locate("elsewhere.png", "porto.gpkg", effort="quick")
+        >>> refused.take(2).status
+        'chosen'
+
+        Parameters
+        ----------
+        place : int or (longitude, latitude)
+            Its number, from 1, or a point near it.
+
+        Raises
+        ------
+        NotLocatedError
+            There is no such place.
+        """
+        from roadgeo.running.choosing import take_place
+
+        return cast(Answer, take_place(self, place))
 
     def plot(self) -> Plot:
         """Draw the mask's place on the map; notebooks show it.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, Reason, RoadgeoError, name_package
+from roadgeo._text import visible
+from roadgeo.errors import IndexFormatError, MaskError, Reason, RoadgeoError, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
@@ -28,11 +30,11 @@ from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
-    from roadgeo.location import Camera, Location, Status
+    from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import AnyReference
     from roadgeo.running.cluster import Cluster
-    from roadgeo.running.looks import Locate
+    from roadgeo.running.looks import Locate, Sighting
     from roadgeo.workflows import LocateOptions
 
 __all__ = [
@@ -81,6 +83,9 @@ def _named_for_workers(names: Sequence[str]) -> list[str]:
 
 
 # --- locating it ------------------------------------------------------------------------------------------------------
+
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -268,28 +273,34 @@ class Locating:
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
         from roadgeo.reference.reference import digest_of
+        from roadgeo.running.choosing import take_place
         from roadgeo.running.queries import locate_query
+        from roadgeo.sources.georeference import read_stated_middle
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
         how = how or (explain if EXPLANATION.name in self.outputs.products else locate)
         options = self.search_options(task)
-        sighting = locate_query(task.mask, asked.references, options, self.options.reading, how=how, say=self.say)
+        paths, reading, sighting = output_paths(self.out_dir, task.stem), self.options.reading, None
+        if self.options.taken is not None:
+            sighting = self._take(task, asked, options)
+        if sighting is None:
+            sighting = locate_query(task.mask, asked.references, options, reading, how=how, say=self.say)
+            if self.options.taken is not None:
+                sighting = sighting.told(take_place(sighting.location, self.options.taken, options))
+        sighting = sighting.showing(stated=None if sighting.location.place is None else read_stated_middle(task.mask))
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         # the clock of the search knows its own steps only: the rest was reading
         spent = location.seconds
         reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine
         location = replace(
-            location,
+            _on_ground(location.spending(open=asked.seconds, read=max(reading_s, 0.0)), self.options.dem),
             query=task.query,
-            camera=_on_ground(location, self.options.dem),
-            seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             command=self._command(task),
-            stated_offset_m=_off_stated(task.mask, location),
             reference_digest=digest_of(asked.references, location.reference),
         )
-        paths, photo = output_paths(self.out_dir, task.stem), self.options.photo(task, sighting.of_photograph)
+        photo = self.options.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
         indexes = [reference.index_of(location) for reference in asked.references]
@@ -303,6 +314,23 @@ class Locating:
             (photo, _scale(photo, mask)) if photo and location.on_map else None,
             faults=tuple(written.faults),
         )
+
+    def _take(self, task: Task, asked: Asked, options: LocateOptions) -> Sighting | None:
+        """Take a place of the last answer for an image; None where there is no such answer, which is said."""
+        from roadgeo.outputs.location_document import read_answer
+        from roadgeo.outputs.paths import output_paths
+        from roadgeo.running.choosing import take_again
+
+        paths, taken = output_paths(self.out_dir, task.stem), self.options.taken
+        try:
+            answer = read_answer(paths.of(JSON))
+        except MaskError:
+            answer = None
+        if answer is None or answer.query != task.query or not answer.places or taken is None:
+            _LOG.warning("%s: no earlier answer lies in %s: searching first", visible(task.query), self.out_dir)
+            return None
+        kept = probability_path(paths)
+        return take_again(answer, taken, task.mask, kept, asked.references, self.options.reading, options)
 
     def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
@@ -353,29 +381,19 @@ def _changed(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, A
     }
 
 
-def _on_ground(location: Location, dem: str) -> Camera | None:
-    """Return the camera with the height of the ground in its frame, where a terrain model knows that."""
-    if not dem or location.camera is None or location.crs is None or location.size is None:
-        return location.camera
+def _on_ground(location: Location, dem: str) -> Location:
+    """Return an answer with the height of the ground in its frame, where a terrain model knows that."""
+    place = location.place
+    if not dem or place is None:
+        return location
     from roadgeo.sources.elevation import ground_heights
 
-    heights = ground_heights(dem, location.pixel_to_map(Frame(*location.size).grid(7, 0.05)), location.crs)
+    heights = ground_heights(dem, place.to_crs(Frame(*place.size).grid(7, 0.05)), place.crs)
     known = heights[np.isfinite(heights)]
     if not len(known):
-        return location.camera
-    return replace(location.camera, ground_m=float(known.mean()), ground_spread_m=float(known.std()))
-
-
-def _off_stated(mask: str, location: Location) -> float | None:
-    """Return how far a found middle lies from where the mask's own georeference puts it; None without one."""
-    from roadgeo.sources.georeference import read_stated_middle
-
-    stated = None if location.center is None else read_stated_middle(mask)
-    if stated is None or location.center is None:
-        return None
-    from pyproj import Geod
-
-    return float(Geod(ellps="WGS84").inv(*stated, location.center.lon, location.center.lat)[2])
+        return location
+    placed = replace(place, ground_m=(float(known.mean()), float(known.std())))
+    return replace(location, places=(placed, *location.places[1:]))
 
 
 def _scale(picture: str, mask: RoadMask) -> float:

@@ -1,60 +1,125 @@
-"""A refusal is no dead end: the user may take one of the places that it lists."""
+"""A refusal is no dead end: the user may take one of the places that it lists. Taking one searches nothing."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from roadgeo.errors import NotLocatedError
-from roadgeo.geometry.projection import transform
-from roadgeo.location import Location, Place, Reason
+from roadgeo.errors import MaskError, NotLocatedError
+from roadgeo.geometry.placement import Placement
+from roadgeo.geometry.projection import metres_apart
+from roadgeo.location import Content, Location, Reason
+from roadgeo.matching.hints import Taken
+from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.scene import Scene, trace_query
+from roadgeo.matching.verdict import match_again
+from roadgeo.reference.reference import AnyReference
+from roadgeo.running.looks import Sighting
+from roadgeo.running.options import ReadOptions
+from roadgeo.running.probability_files import is_ours
+from roadgeo.running.queries import look_once
+from roadgeo.running.variants import resampled
 
-__all__ = ["choose_place"]
+__all__ = ["take_again", "take_place"]
 
 
-def choose_place(location: Location, options: LocateOptions) -> Location:
-    """Return the place that the user takes, where nothing is located; its score stays as it is.
+def take_place(location: Location, taken: Taken, options: LocateOptions | None = None) -> Location:
+    """Return an answer with one of its places as the one that the user takes; its score stays as it is.
 
     Raises
     ------
     NotLocatedError
         The answer lists no such place.
     """
-    number, places = options.take, location.places
-    if number is None or location.located:
-        return location
-    if number > len(places):
-        listed = {0: "none is listed", 1: "1 is listed"}.get(len(places), f"{len(places)} are listed")
+    places = location.places
+    if not places:
+        raise NotLocatedError(f"{location.query}: no place is listed that could be taken ({location.reason})")
+    number = taken if isinstance(taken, int) else _nearest(location, taken)
+    if not 1 <= number <= len(places):
+        listed = "1 is listed" if len(places) == 1 else f"{len(places)} are listed"
         raise NotLocatedError(f"{location.query}: there is no place {number}: {listed} ({location.reason})")
-    place = places[number - 1]
-    frame = place.frame
-    center = None if frame is None else frame.center
-    if frame is None or center is None:
-        raise NotLocatedError(f"{location.query}: place {number} is known by its middle only; take another")
-    # Where the likeliest place leads nothing, the odds of another are given against that one alone.
-    odds = min(place.log10_odds, places[0].log10_odds)
-    others = tuple(_in_crs_of(frame, other) for k, other in enumerate(places, 1) if k != number)
+    if location.located and number == 1:
+        return location
+    needed = (options or LocateOptions()).min_log10_odds
+    # Where the likeliest place leads nothing, the score of another is against that one alone.
+    score = min(places[number - 1].score, places[0].score)
+    others = tuple(replace(place, rival=None) for k, place in enumerate(places, 1) if k != number)
+    chosen = replace(places[number - 1], score=score, rival=others[0] if others else None)
     return replace(
-        frame,
-        query=location.query,
+        location,
         status="chosen",
-        reason=f"chosen by you: place {number} of {len(places)}; the score is {odds:z.1f},"
-        f" {options.min_log10_odds:g} is asked for",
+        reason=f"chosen by you: place {number} of {len(places)}; the score is {score:z.1f}, {needed:g} is asked for",
         reason_code=Reason.CHOSEN,
-        log10_odds=odds,
-        center=replace(center, log10_odds=odds),
-        runner_up=others[0] if others else None,
-        alternatives=others,
-        seconds=location.seconds,
-        stats=location.stats,
-        stopped=location.stopped,
-        query_to_pixel=location.query_to_pixel,
+        places=(chosen, *others),
+        reference=chosen.reference,
+        attribution=chosen.attribution,
     )
 
 
-def _in_crs_of(frame: Location, place: Place) -> Place:
-    """Return a place in the CRS of the one that is taken; it cannot be taken any more."""
-    x, y = transform("EPSG:4326", str(frame.crs), np.array([[place.lon, place.lat]]))[0].tolist()
-    return replace(place, x=x, y=y, frame=None)
+def take_again(
+    answer: Location,
+    taken: Taken,
+    image: str,
+    kept: Path,
+    references: Sequence[AnyReference],
+    reading: ReadOptions,
+    options: LocateOptions,
+) -> Sighting:
+    """Take a place of an earlier answer: its image is read again for drawing it, and searched for nowhere.
+
+    Parameters
+    ----------
+    kept : Path
+        Where the probability of road in a photograph lies, if it was kept.
+
+    Raises
+    ------
+    NotLocatedError
+        The answer lists no such place.
+    MaskError, ModelError
+        The image cannot be read.
+    """
+    location = take_place(answer, taken, options)
+    place, of_photograph = location.places[0], is_ours(kept)
+    first = look_once(str(kept) if of_photograph else image, (place.gsd_m, place.gsd_m), reading)
+    height_width = place.size[::-1]
+    mask = first.mask if first.mask.shape == height_width else resampled(first.mask, height_width).mask
+    mask = replace(mask, name=image)
+    try:
+        scene, graph = trace_query(mask)
+    except MaskError:  # the photograph shows hardly a road
+        return Sighting(location, mask, of_photograph=of_photograph or first.of_photograph)
+    content = Content(place.size, graph, scene.intersections.xy)
+    place = _matched(place, scene, [reference.index_of(location) for reference in references])
+    location = replace(location, content=content, places=(place, *location.places[1:]))
+    return Sighting(location, mask, of_photograph=of_photograph or first.of_photograph)
+
+
+def _matched(place: Placement, scene: Scene, indexes: Sequence[ReferenceIndex]) -> Placement:
+    """Return a place with the intersections that match there, where its map is among those that are open."""
+    index = next((one for one in indexes if one.name == place.reference and one.plane.crs == place.crs), None)
+    return place if index is None else replace(place, matches=match_again(place, scene, index))
+
+
+def _nearest(location: Location, lonlat: tuple[float, float]) -> int:
+    """Return the number of the listed place whose middle is nearest to longitude and latitude.
+
+    Raises
+    ------
+    NotLocatedError
+        None lies within a frame's width.
+    """
+    away = [metres_apart(np.array(place.center[2:]), np.array(lonlat)) for place in location.places]
+    nearest = int(np.argmin(away))
+    place = location.places[nearest]
+    reach_m = place.gsd_m * max(place.size)
+    if away[nearest] > reach_m:
+        raise NotLocatedError(
+            f"{location.query}: no listed place lies within {reach_m:.0f} m of {lonlat[0]:g},{lonlat[1]:g}; the "
+            f"nearest is place {nearest + 1}, {away[nearest]:.0f} m away"
+        )
+    return nearest + 1

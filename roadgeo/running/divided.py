@@ -48,6 +48,9 @@ __all__ = ["owners", "run_divided"]
 #: Seconds of work of the first look, on a map of 15,000 intersections: nearly all masks that are found need less.
 _FIRST_LOOK_S = 0.1
 
+#: Places that score less than an answer needs by no more than this are searched again, together: they may be rivals.
+_BELOW = 2.0
+
 #: Masks under way: while one is traced or written, workers search for the others.
 _AHEAD = 3
 
@@ -206,7 +209,7 @@ class _Searcher:
         parts = [self.parts[name] for name in names]
         found = search_references(query, parts, options, options.search.time_limit_s)
         found = [result.less_likely(asked.against) for result in found]
-        least = options.min_log10_odds - options.min_margin
+        least = options.min_log10_odds - _BELOW
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
         strong = [place for result in found for place in result.compared if place.score >= least]
         places = [(place.score, by_path[_path(place.index)]) for place in strong]

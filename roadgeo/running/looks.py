@@ -15,8 +15,9 @@ import numpy as np
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import metres_apart
-from roadgeo.location import Location, Place, Reason, Seconds
+from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
@@ -26,6 +27,8 @@ __all__ = ["Locate", "Seen", "Sighting", "locate_looks", "total_seconds"]
 
 #: Share of the work left that a look may take; the last one may take all.
 _SHARE = 0.6
+#: Score by which a place must lead one that another look found elsewhere.
+_LEAST_LEAD = 2.0
 
 Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location | Explanation"]
 
@@ -59,6 +62,15 @@ class Sighting:
     explanation: Explanation | None = None
     probability: ProbabilityMap | None = None
     of_photograph: bool = False
+
+    def told(self, location: Location) -> Sighting:
+        """Return it with another answer."""
+        return replace(self, location=location)
+
+    def showing(self, **content: Any) -> Sighting:
+        """Return it with more of what the image shows (see `location.Content`)."""
+        shown = self.location.content or Content(self.mask.shape[::-1])
+        return self.told(replace(self.location, content=replace(shown, **content)))
 
 
 def locate_looks(
@@ -97,7 +109,7 @@ def locate_looks(
             continue
         explanation, location = (found, found.location) if isinstance(found, Explanation) else (None, found)
         seconds = location.seconds
-        work_left -= location.stats.work_ms / 1000
+        work_left -= location.spent.stats.work_ms / 1000
         time_left -= seconds.vectorize + seconds.match + seconds.refine
         location = _discount(location, seen.what, tried, options)
         sightings.append(Sighting(location, seen.mask, explanation, seen.probability))
@@ -105,7 +117,7 @@ def locate_looks(
             break
     if not sightings:
         raise failure or MaskError("nothing to look at; give a mask or a photograph")
-    return _best_of(sightings, options)
+    return _best_of(sightings)
 
 
 def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -> LocateOptions:
@@ -114,19 +126,15 @@ def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -
 
 
 def _discount(location: Location, what: str, tried: int, options: LocateOptions) -> Location:
-    """Take log10 of the number of looks off the odds; a place that is then too unlikely is not located."""
-    off = math.log10(tried)
+    """Take log10 of the number of looks off the scores; a place that then scores too little is not located."""
     if tried == 1 or location.log10_odds is None:
         return location
-    odds = location.log10_odds - off
-    if odds < options.min_log10_odds:
-        few = f"one place stands out, at {what}, but not clearly enough; {_in_ways(tried)}"
-        return _refused(location, few)
-    reason = f"{location.reason}; {_in_ways(tried)}, here at {what}"
-    center = None if location.center is None else replace(location.center, log10_odds=odds)
-    others = tuple(_less_sure(place, off) for place in location.alternatives)
-    runner_up = location.runner_up and _less_sure(location.runner_up, off)
-    return replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others)
+    places = tuple(_less_sure(place, math.log10(tried)) for place in location.places)
+    location = replace(location, places=places)
+    if places[0].score >= options.min_log10_odds or location.place is None:
+        return location if location.place is None else location.saying(f"{_in_ways(tried)}, here at {what}")
+    few = f"one place stands out, at {what}, but not clearly enough; {_in_ways(tried)}"
+    return replace(location, status="not_located", reason=few, reason_code=Reason.TOO_MANY_LOOKS)
 
 
 def _in_ways(tried: int) -> str:
@@ -134,19 +142,12 @@ def _in_ways(tried: int) -> str:
     return f"its roads were traced in {tried} ways"
 
 
-def _less_sure(place: Place, off: float) -> Place:
-    return replace(place, log10_odds=place.log10_odds - off)
+def _less_sure(place: Placement, off: float) -> Placement:
+    rival = place.rival and _less_sure(place.rival, off)
+    return replace(place, score=place.score - off, rival=rival)
 
 
-def _refused(location: Location, reason: str) -> Location:
-    """Return a location of which nothing is left but what was seen."""
-    names = ("query", "reference", "attribution", "size", "n_intersections", "seconds", "stats", "stopped", "seen")
-    kept: dict[str, Any] = {name: getattr(location, name) for name in names}
-    code = Reason.TOO_MANY_LOOKS
-    return Location(status="not_located", reason=reason, reason_code=code, alternatives=location.places, **kept)
-
-
-def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
+def _best_of(sightings: Sequence[Sighting]) -> Sighting:
     """Return the best answer, the first of equals; a rival elsewhere that is almost as sure makes it ambiguous."""
     rank = {"located": 2, "ambiguous": 1, "not_located": 0}
     best = max(
@@ -158,36 +159,32 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
         ),
     )
     locations = [sighting.location for sighting in sightings]
-    location = replace(best.location, seconds=total_seconds(*(sighting.location.seconds for sighting in sightings)))
+    location = best.location.spending(**total_seconds(locations))
     if len(sightings) > 1 and location.status == "not_located":
-        location = replace(location, reason=f"{location.reason}; {_in_ways(len(sightings))}")
-    rivals = [found for found in locations if found is not best.location and _elsewhere(found, location)]
-    rival = max(rivals, key=lambda found: found.log10_odds or -math.inf, default=None)
-    if location.located and rival is not None:
-        lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
-        if lead < options.min_margin:
-            reason = f"two places fit almost equally; {_in_ways(len(sightings))}"
-            others = (*rival.places[:1], *location.alternatives)
-            location = replace(
-                location,
-                status="ambiguous",
-                reason=reason,
-                reason_code=Reason.TWO_LOOKS,
-                runner_up=rival.center,
-                alternatives=others,
-            )
+        location = location.saying(_in_ways(len(sightings)))
+    rivals = [other for other in locations if other is not best.location and _elsewhere(other, location)]
+    rival = max((other.places[0] for other in rivals), key=lambda place: place.score, default=None)
+    if location.located and rival is not None and location.places[0].score - rival.score < _LEAST_LEAD:
+        first, *others = location.places
+        location = replace(
+            location,
+            status="ambiguous",
+            reason=f"two places fit almost equally; {_in_ways(len(sightings))}",
+            reason_code=Reason.TWO_LOOKS,
+            places=(replace(first, rival=rival), rival, *others),
+        )
     return replace(best, location=location)
 
 
-def total_seconds(*spent: Seconds) -> Seconds:
-    """Return the time of several searches of one query."""
+def total_seconds(locations: Sequence[Location]) -> dict[str, float]:
+    """Return the time of several searches of one query, by step."""
     steps = ("vectorize", "match", "refine")
-    return replace(spent[0], **{step: sum(getattr(seconds, step) for seconds in spent) for step in steps})
+    return {step: sum(getattr(location.seconds, step) for location in locations) for step in steps}
 
 
 def _elsewhere(other: Location, best: Location) -> bool:
     """Whether a location, sure or ambiguous, lies more than half a frame from another."""
-    if other.center is None or best.center is None or best.footprint is None:
+    if other.place is None or best.place is None:
         return False
-    apart_m = metres_apart(*(np.array([place.lon, place.lat]) for place in (other.center, best.center)))
-    return bool(apart_m > 0.5 * np.hypot(*(best.footprint[1] - best.footprint[0])))
+    apart_m = metres_apart(*(np.array(place.center[2:]) for place in (other.place, best.place)))
+    return bool(apart_m > 0.5 * np.hypot(*(best.place.footprint[1] - best.place.footprint[0])))

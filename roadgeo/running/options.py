@@ -106,6 +106,8 @@ class BatchOptions:
         Terrain model with the height of the ground below the camera; "" for none.
     skip_existing : bool
         Keep results of the same question that are whole and younger than their masks.
+    taken : int, or (lon, lat), or None
+        The place of the last answer for an image that is written as its place (see `choosing.take_place`).
     command : tuple of str
         Options that ask for the same on the command line, for the results to name.
     """
@@ -117,6 +119,7 @@ class BatchOptions:
     exif: bool = False
     dem: str = ""
     skip_existing: bool = False
+    taken: int | tuple[float, float] | None = None
     command: tuple[str, ...] = ()
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:

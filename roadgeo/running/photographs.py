@@ -20,7 +20,7 @@ from roadgeo._progress import Say
 from roadgeo.errors import MaskError, PluginError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location, Reason
+from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.verdict import searched_within
 from roadgeo.plugins import SEGMENTERS, call_plugin
@@ -250,7 +250,7 @@ def locate_photograph(
             return _see_hardly_a_road(frame, ways, error, references)
     sighting = _in_own_pixels(found, frame.own)
     reason = sighting.location.reason.replace(searched_within(on_grid), searched_within(options))
-    return replace(sighting, location=replace(sighting.location, reason=reason, part_read=frame.photograph.page))
+    return sighting.told(replace(sighting.location, reason=reason)).showing(part=frame.photograph.page)
 
 
 def _see_hardly_a_road(
@@ -263,7 +263,7 @@ def _see_hardly_a_road(
         "not_located",
         f"hardly a road is seen in the photograph ({error})",
         ", ".join(reference.name for reference in references),
-        size=(width, height),
+        content=Content((width, height)),
         reason_code=Reason.FEW_ROADS,
     )
     seen = frame.see(frame.scale(0), ways).resized(frame.own)

@@ -20,7 +20,6 @@ from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference, swapped_near
-from roadgeo.running.choosing import choose_place
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, open_frame, plugin_of
@@ -60,22 +59,8 @@ def locate_query(
         There is no model, or it cannot be run.
     PluginError
         A segmenter fails.
-    NotLocatedError
-        A place is to be taken that the answer does not list.
     """
     options, reading = options or LocateOptions(), reading or ReadOptions()
-    sighting = _look_for(path, references, options, reading, how, say)
-    return replace(sighting, location=choose_place(sighting.location, options))
-
-
-def _look_for(
-    path: str | AnyArray,
-    references: Sequence[AnyReference],
-    options: LocateOptions,
-    reading: ReadOptions,
-    how: Locate,
-    say: Say,
-) -> Sighting:
     if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
         return _locate_lines(path, references, options, reading, undoing(how, None, bool(reading.mirror)))
     stated = cache(lambda: read_pixel_shape(path) if isinstance(path, str) else (None, False))
@@ -88,8 +73,7 @@ def _look_for(
 
     sighting = _look_at(path, references, options, reading, upright, say)
     if reading.mirror is None and stated()[1]:
-        reason = f"{sighting.location.reason}; the georeference of the file mirrors it, which was undone"
-        sighting = replace(sighting, location=replace(sighting.location, reason=reason))
+        sighting = sighting.told(sighting.location.saying("the georeference of the file mirrors it, which was undone"))
     return sighting
 
 
@@ -105,12 +89,12 @@ def _look_at(
     with _open_as_mask(path, reading) as mask:
         if mask is not None:
             sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
-            return replace(sighting, location=replace(sighting.location, part_read=mask.part))
+            return sighting.showing(part=mask.part)
     with as_file(path) as file:
         sighting = locate_photograph(file, references, options, reading, how, say)
         if not isinstance(path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
-            sighting = replace(sighting, location=replace(sighting.location, query=_ARRAY, reason=reason))
+            sighting = sighting.told(replace(sighting.location, query=_ARRAY, reason=reason))
     return replace(sighting, of_photograph=True)
 
 
@@ -131,6 +115,7 @@ class FirstLook:
     mask: RoadMask
     coarser: float = 1.0
     probability: ProbabilityMap | None = None
+    of_photograph: bool = False
 
 
 def look_once(
@@ -155,14 +140,14 @@ def look_once(
     with as_file(path) as file:
         plugin = plugin_of(reading)
         if plugin:
-            return FirstLook(call_segmenter(plugin, file, reading.threshold))
+            return FirstLook(call_segmenter(plugin, file, reading.threshold), of_photograph=True)
         with open_frame(file, reading, gsd_m or CameraOptions().gsd_m, say) as frame:
             seen = frame.see(frame.scale(0), None)
             try:
                 roads = frame.look(Look()).mask
             except MaskError:  # the roads seen are worth a look all the same
                 roads = RoadMask(np.zeros(frame.grid, np.bool_), name=file)
-            return FirstLook(roads, frame.coarser, seen.resized(frame.own))
+            return FirstLook(roads, frame.coarser, seen.resized(frame.own), of_photograph=True)
 
 
 @contextmanager
@@ -218,4 +203,4 @@ def _locate_lines(
         camera = replace(camera, gsd_m=known, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
     options = replace(options, match=replace(options.match, camera=camera))
     sighting = locate_looks([drawing.mask], lambda mask: Seen("its lines", mask), references, options, how)
-    return replace(sighting, location=replace(sighting.location, query_to_pixel=drawing.to_pixel))
+    return sighting.showing(lines_to_pixels=drawing.to_pixel)

@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray, IntArray
+from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -26,9 +25,6 @@ from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Locate
 
 __all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "undoing"]
-
-#: A camera's pixels are square to this share; what is stretched more has no camera that saw it.
-_SQUARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -74,60 +70,13 @@ def resampled(mask: RoadMask, shape: tuple[int, int]) -> Variant:
 
 def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) -> Location:
     """Return a variant's location in pixels of a query of (width, height), which `matrix` takes to the variant's."""
-    if location.size is None:
-        return location
-    side = math.sqrt(abs(float(np.linalg.det(matrix))))  # pixels of the variant for each of the query, along a side
-    back = Homography(PIXEL_TO_PLANE @ Homography(matrix).inverse().matrix @ PIXEL_TO_PLANE)
-    camera, homography, seen, evidence = location.camera, location.homography, location.seen, location.evidence
-    order, turns = _order_of_corners(location.size, size, matrix), bool(np.linalg.det(matrix[:2, :2]) < 0.0)
-    changed: dict[str, Any] = {"size": size, "mirrored": location.mirrored != turns}
-    changed["alternatives"] = tuple(
-        replace(
-            place,
-            footprint_lonlat=place.footprint_lonlat and tuple(place.footprint_lonlat[k] for k in order.tolist()),
-            frame=place.frame and in_pixels_of(place.frame, size, matrix),
-        )
-        for place in location.alternatives
-    )
-    if homography is not None:
-        homography = homography @ matrix
-        changed.update(homography=homography / homography[2, 2], **_corners_of(location, order))
-    if location.gsd_m is not None:
-        changed["gsd_m"] = location.gsd_m * side
-    if turns or abs(np.divide(*np.hypot(*matrix[:2, :2])) - 1.0) > _SQUARE:
-        changed.update(camera=None, tilt_deg=None)
-    elif camera is not None:
-        changed["camera"] = replace(
-            camera, focal_px=camera.focal_px / side, focal_sigma_px=camera.focal_sigma_px / side
-        )
-    if seen is not None:
-        changed["seen"] = replace(seen, graph=_moved(seen.graph, back), xy=back(seen.xy))
-    if evidence is not None:
-        graph, xy = _moved(evidence.query_graph, back), back(evidence.query_xy)
-        changed["evidence"] = replace(evidence, query_graph=graph, query_xy=xy)
-    return replace(location, **changed)
-
-
-def _order_of_corners(theirs: tuple[int, int], size: tuple[int, int], matrix: FloatArray) -> IntArray:
-    """Return which corner of a variant of (width, height) each corner (4,) of the query is."""
-    corners = Homography(matrix)(Frame(*size).corners)
-    return np.asarray(np.hypot(*(corners[:, None] - Frame(*theirs).corners[None]).transpose(2, 0, 1)).argmin(axis=1))
-
-
-def _corners_of(location: Location, order: IntArray) -> dict[str, Any]:
-    """Return what is known of a variant's corners in the order of the query's."""
-    pairs = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
-    covariance = location.corner_covariance_m2
-    found = {name: getattr(location, name) for name in ("footprint", "footprint_lonlat", "corner_sigma_m")}
-    return {
-        **{name: None if values is None else values[order] for name, values in found.items()},
-        "corner_covariance_m2": None if covariance is None else covariance[np.ix_(pairs, pairs)],
-    }
-
-
-def _moved(graph: Any, move: Homography) -> Any:
-    """Return a road graph whose coordinates are moved."""
-    return replace(graph, xy=move(graph.xy), coords=move(graph.coords))
+    places, content = tuple(place.in_pixels(size, matrix) for place in location.places), location.content
+    if content is not None:
+        back = Homography(PIXEL_TO_PLANE @ np.linalg.inv(matrix) @ PIXEL_TO_PLANE)
+        graph = content.graph
+        moved = None if graph is None else replace(graph, xy=back(graph.xy), coords=back(graph.coords))
+        content = replace(content, size=size, graph=moved, xy=back(content.xy))
+    return replace(location, places=places, content=content)
 
 
 def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
@@ -156,7 +105,8 @@ def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
 
 def _stating_pixels(location: Location, aspect: float | None) -> Location:
     """Return a location whose reason states the shape of the pixels on the ground, where they are not square."""
-    if location.homography is None or location.size is None or aspect in (None, 1.0):
+    place = location.place
+    if place is None or aspect in (None, 1.0):
         return location
-    wide, high = np.hypot(*Homography(location.homography).jacobian(Frame(*location.size).center))
-    return replace(location, reason=f"{location.reason}; its pixels are {wide / high:.2f} times as wide as high")
+    wide, high = np.hypot(*Homography(place.matrix).jacobian(Frame(*place.size).center))
+    return location.saying(f"its pixels are {wide / high:.2f} times as wide as high")

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._arrays import FloatArray
+from roadgeo._version import __version__
 from roadgeo.errors import CrsError, RoadgeoError
 from roadgeo.geometry.displacement import Displacement
 from roadgeo.geometry.frame import Frame
@@ -20,7 +20,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 from roadgeo.geometry.transformation import exactness
-from roadgeo.location import Location
+from roadgeo.location import Location, Spent
 from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
@@ -156,7 +156,7 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
         checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)
         results.append(checked)
         known = checked.verdict != "unknown"
-        return Location(mask.name, "located" if known else "not_located", checked.reason, seconds=query.seconds)
+        return Location(mask.name, "located" if known else "not_located", checked.reason, spent=Spent(query.seconds))
 
     gsd = math.sqrt(abs(np.linalg.det(Homography(start).jacobian(Frame(*image.place.size).center))))
     options = LocateOptions()

@@ -21,7 +21,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.reference.reference import AnyReference
 from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, problem
 from roadgeo.serving.jobs import Job, Jobs
@@ -29,7 +29,7 @@ from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.page import page_file, page_text, policy_of
 from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
-from roadgeo.serving.view import OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
+from roadgeo.serving.view import KEPT, OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
 from roadgeo.serving.workers import Answer, Asked, Workers
 
 __all__ = ["Service"]
@@ -120,7 +120,7 @@ class Service:
         if not old.path.is_file():
             raise HTTPException(404, "its image is not kept: send it again")
         with self._jobs.room() as folder:
-            await asyncio.to_thread(_copy, old, folder)
+            await asyncio.to_thread(_copy, old, folder, "take" in hints)
             return self._start(Job(folder, old.image, old.name, hints), came, f"../{folder.name}")
 
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
@@ -298,13 +298,14 @@ async def _take(request: Request, folder: Path) -> Job:
     return Job(folder, image_path.name, Path(name).name[:200], hints)
 
 
-def _copy(old: Job, folder: Path) -> None:
-    """Copy an image, with the roads seen in it, into another folder."""
+def _copy(old: Job, folder: Path, takes: bool) -> None:
+    """Copy an image, with the roads seen in it, into another folder; its answer too, where a place of it is taken."""
     shutil.copyfile(old.path, folder / SENT / old.image)
-    seen = old.folder / OWN / SEEN
-    if seen.is_file():
-        (folder / OWN).mkdir()
-        shutil.copyfile(seen, folder / OWN / SEEN)
+    for name in (SEEN, *[KEPT] * takes):
+        kept = old.folder / OWN / name
+        if kept.is_file():
+            (folder / OWN).mkdir(exist_ok=True)
+            shutil.copyfile(kept, folder / OWN / name)
 
 
 def _report(listener: Listener, document: dict[str, Any], came: float) -> None:

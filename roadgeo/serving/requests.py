@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 
 from starlette.exceptions import HTTPException
 
-from roadgeo.matching.hints import HINTS, read_numbers
+from roadgeo.matching.hints import HINTS, read_taken
 
 __all__ = ["LIMIT", "ending_of", "read_hints", "read_query_string"]
 
@@ -29,8 +29,8 @@ _MAGIC = {
 #: Hints by their names over HTTP, and the most letters of a value.
 _NAMES = {hint.parameter: hint for hint in HINTS.values()}
 _MOST_LETTERS = 200
-#: Name of the place that is taken of those that a refusal lists, and the greatest number.
-_TAKE, _MOST_PLACES = "take", 100
+#: Name of the place that is taken of those that an answer lists.
+_TAKE = "take"
 #: Under this name a time limit stands among the hints.
 LIMIT = HINTS["time_limit"].goes_to
 
@@ -79,7 +79,7 @@ def read_hints(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
             raise HTTPException(400, f"got {str(name)[:40]!r}, expected one of {', '.join([*_NAMES, _TAKE])}")
         if isinstance(value, str) and len(value) > _MOST_LETTERS:
             raise HTTPException(400, f"{name}: a text of {len(value)} characters, expected at most {_MOST_LETTERS}")
-        goes_to, read = (_TAKE, _read_take) if name == _TAKE else (_NAMES[name].goes_to, _NAMES[name].read)
+        goes_to, read = (_TAKE, read_taken) if name == _TAKE else (_NAMES[name].goes_to, _NAMES[name].read)
         if goes_to in hints:
             raise HTTPException(400, f"{name} is given twice: give it once")
         try:
@@ -87,12 +87,3 @@ def read_hints(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         except ValueError as error:
             raise HTTPException(400, f"{name}: {error}") from error
     return hints
-
-
-def _read_take(value: Any) -> int:
-    """Read the number of a place; raise ValueError for what is no such number."""
-    form = f"the number of a place, 1 to {_MOST_PLACES}"
-    (number,) = read_numbers(value, form, (1,))
-    if number not in range(1, _MOST_PLACES + 1):
-        raise ValueError(f"got {number:g}, expected {form}")
-    return int(number)

@@ -11,7 +11,7 @@ import socket
 
 import uvicorn
 
-from roadgeo import __version__
+from roadgeo._version import __version__
 from roadgeo.serving.app import Service
 from roadgeo.serving.workers import Workers
 

@@ -8,6 +8,7 @@ import pickle
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,32 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.location import Location
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import draw_picture
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
 from roadgeo.outputs.subject import Subject, ViewOptions
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.storage.files import replacing
 
-__all__ = ["OFFERED", "OWN", "PICTURE", "SEEN", "SENT", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
+__all__ = [
+    "KEPT",
+    "OFFERED",
+    "OWN",
+    "PICTURE",
+    "SEEN",
+    "SENT",
+    "VIEW",
+    "WARPED",
+    "read_sighting",
+    "safe_stem",
+    "write_output",
+    "write_view",
+]
 
 #: Folders of a job: the image as it was sent, files of our own, and outputs that were asked for. Apart from each other,
 #: for senders choose names.
@@ -40,7 +54,7 @@ SENT, OWN, _OUTPUTS = "sent", "own", "outputs"
 #: Names of files of our own: the picture reduced, the same on the map, all else that is shown,
 #: and of a photograph the probability of road.
 PICTURE, WARPED, VIEW, SEEN = "picture.jpg", "warped.webp", "view.json", "seen.tif"
-_KEPT = "kept.pickle.gz"
+KEPT = "kept.pickle.gz"
 
 #: Outputs that an answer offers. A virtual raster would lead to a file that its reader has not.
 OFFERED: dict[str, Output] = {
@@ -78,9 +92,18 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     if sighting.probability is not None:
         sighting.probability.write(folder / SEEN)
     (folder / VIEW).write_text(json.dumps(view, allow_nan=False), encoding="utf-8")
-    kept = (location, sighting.mask, sighting.of_photograph)
-    with gzip.open(folder / _KEPT, "wb", compresslevel=1) as file:
-        pickle.dump(kept, file)
+    with gzip.open(folder / KEPT, "wb", compresslevel=1) as file:
+        pickle.dump(replace(sighting, explanation=None, probability=None), file)
+
+
+def read_sighting(path: Path) -> Sighting | None:
+    """Return the answer that is kept for the image at `path`; None where none is."""
+    kept = path.parent.with_name(OWN) / KEPT
+    if not kept.is_file():
+        return None
+    with gzip.open(kept, "rb") as file:  # our own, in a folder that is ours alone
+        sighting: Sighting = pickle.load(file)  # noqa: S301
+    return sighting
 
 
 def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> Path:
@@ -91,9 +114,10 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
     OutputError, MaskError, CrsError
         It cannot be made.
     """
-    location: Location
-    with gzip.open(path.parent.with_name(OWN) / _KEPT, "rb") as file:  # our own, in a folder that is ours alone
-        location, mask, of_photograph = pickle.load(file)  # noqa: S301
+    sighting = read_sighting(path)
+    if sighting is None:
+        raise OutputError("its answer is not kept any more: send the image again")
+    location, mask, of_photograph = sighting.location, sighting.mask, sighting.of_photograph
     folder = path.parent.with_name(_OUTPUTS)
     output, paths = OFFERED[name], output_paths(folder, path.stem)
     if not output.suits(location.on_map, location.camera is not None):
@@ -141,7 +165,7 @@ def _draw_on_map(path: Path, shown: Subject) -> list[list[float]] | None:
     """Draw the picture as web maps are drawn; return where its corners lie, from the top left; None where nowhere."""
     _, *ways = choose_target(shown.place, ImageOptions(crs=_WEB))
     image, smooth = draw_picture(shown, rgb("query")), shown.photo is not None
-    warped, grid = shown.place.draw(image, shown.mask_size, _MAP_SIDE**2, ways, smooth)
+    warped, grid = warp_picture(shown.place, image, shown.mask_size, _MAP_SIDE**2, ways, smooth)
     if grid.width == 0 or grid.width * grid.resolution > _WORLD_M / 4:
         return None
     path.write_bytes(encode(warped, path.suffix, cv2.IMWRITE_WEBP_QUALITY, _QUALITY))

@@ -210,9 +210,10 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     from dataclasses import replace
 
     from roadgeo.matching.hints import apply_hints
+    from roadgeo.running.choosing import take_place
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.queries import locate_query
-    from roadgeo.serving.view import OWN, SEEN, write_view
+    from roadgeo.serving.view import OWN, SEEN, read_sighting, write_view
     from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.storage.rasters import raster_size
     from roadgeo.workflows import LocateOptions, locate
@@ -231,15 +232,19 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     hints = {**asked.hints, "time_limit_s": asked.time_limit_s}
     if hints.get("focal_px") == "exif":
         hints["focal_px"] = focal_in_pixels(asked.path)
-    options = replace(apply_hints(LocateOptions(), hints), take=hints.get("take"))
+    taken, options = hints.pop("take", None), apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     seen = Path(asked.path).parent.with_name(OWN) / SEEN
     is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
     image, query = str(seen) if is_known else asked.path, ReadOptions(threads=threads)
-    sighting = locate_query(image, references, options, query, how=search, say=tell)
-    sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
+    sighting = None if taken is None else read_sighting(Path(asked.path))  # of the answer whose place is taken
+    if sighting is None:
+        sighting = locate_query(image, references, options, query, how=search, say=tell)
+        sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
+    if taken is not None:
+        sighting = sighting.told(take_place(sighting.location, taken, options))
     location = replace(sighting.location, query=asked.name)
     location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
     lacks_view = False

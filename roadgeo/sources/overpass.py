@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import counted, visible
+from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways
 from roadgeo.sources.containers import overpass_table, what_is_missing

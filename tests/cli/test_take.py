@@ -44,7 +44,7 @@ def test_a_refusal_shows_the_places_by_their_numbers(porto, refused, capfd):
     assert main(["locate", PATHS["elsewhere"], "-r", str(porto)]) == 3
     (listed,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("  best places, 1: ")]
     second = refused.alternatives[1]
-    assert f", 2: {format_lonlat(second.lon, second.lat)}, 3: " in listed
+    assert f", 2: {format_lonlat(*second.center[2:])}, 3: " in listed
     assert listed.endswith("; where you know one to be right, --take its number")
 
 
@@ -56,7 +56,7 @@ def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd
     assert {"elsewhere_footprint.tif", "elsewhere_location.gpkg", "elsewhere_report.html"} <= written
     found, listed = json.loads(Path("elsewhere_location.json").read_text()), refused.alternatives
     assert (found["status"], found["reason_code"], found["error_rate"]) == ("chosen", "chosen", None)
-    score = min(listed[n - 1].log10_odds, listed[0].log10_odds)
+    score = min(listed[n - 1].score, listed[0].score)
     assert found["log10_odds"] == pytest.approx(score)
     assert found["reason"] == (
         f"chosen by you: place {n} of {len(listed)}; the score is {score:z.1f}, 3.5 is asked for"
@@ -64,7 +64,7 @@ def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd
     off = np.array(found["footprint_lonlat"]) - listed[n - 1].footprint_lonlat
     assert np.abs(off).max() < 0.001
     others = [place["center"]["lon"] for place in found["alternatives"]]
-    assert others == [place.lon for place in listed if place is not listed[n - 1]]
+    assert others == [place.center.lon for place in listed if place is not listed[n - 1]]
     assert found["command"].count("--take") == 1
 
 
@@ -104,4 +104,4 @@ def test_the_report_of_a_refusal_names_the_places_and_the_option(porto, refused)
     page = Path("elsewhere_report.html").read_text()
     assert "--take N" in page
     for place in refused.alternatives:
-        assert f"{place.lat:.5f}" in page
+        assert f"{place.center.lat:.5f}" in page

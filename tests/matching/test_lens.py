@@ -116,9 +116,7 @@ def test_a_wrong_place_does_not_grow(town):
 
 def honest(matrix, scene, index):
     """The deviations of the corners that are claimed for a homography."""
-    return with_honest_corners(
-        Refined(matrix, np.ones(4), 1.0, np.eye(8)), scene, index, RefineOptions()
-    ).corner_sigma_m
+    return with_honest_corners(Refined(matrix, 1.0, np.eye(8)), scene, index, RefineOptions()).corner_sigma_m
 
 
 def test_corners_that_a_tilted_frame_shows_far_away_are_less_sure(town):
@@ -144,7 +142,7 @@ def test_where_a_mask_is_bent_corners_are_about_as_sure_as_claimed(town):
 def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town, monkeypatch):
     truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     scene = through_lens(straight, -0.12)
-    claimed = Refined(truth, np.ones(4), 1.0, np.eye(8), -0.12)
+    claimed = Refined(truth, 1.0, np.eye(8), -0.12)
     corners = []
     for sigma in (0.0, 2.0):
         monkeypatch.setattr(finishing, "_CENTER_SIGMA_PX", sigma)
@@ -156,7 +154,7 @@ def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town, monkeypatch)
 def test_where_hardly_a_road_is_met_the_claim_stays(town):
     truth, scene = sight_of(town[0], 8)
     nowhere = truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]])
-    assert (honest(nowhere, scene, town[1]) == 1.0).all()
+    assert honest(nowhere, scene, town[1]) == pytest.approx(np.full(4, np.sqrt(2.0)))
 
 
 def test_where_most_of_a_frame_is_astray_and_hardly_a_road_is_left_the_claim_stays(town):

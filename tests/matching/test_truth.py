@@ -9,8 +9,9 @@ import pytest
 from worlds.scenes import PLANE, random_network
 
 from roadgeo.geometry.camera import CameraFault, CameraOptions
+from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.location import Location, Place
+from roadgeo.location import Location
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
@@ -57,7 +58,8 @@ def test_the_first_stage_that_it_did_not_come_out_of(estimator, met, lost_at, sa
 
 
 def place(x, y):
-    return Location("q", "located", "", center=Place(0.0, 0.0, *lonlat(x, y), 9.0), gsd_m=1.0)
+    place = Placement((1000, 1000), PLANE, np.array([[1.0, 0.0, x - 500.0], [0.0, -1.0, y + 500.0], [0.0, 0.0, 1.0]]))
+    return Location("q", "located", "", places=(place,))
 
 
 @pytest.mark.parametrize(

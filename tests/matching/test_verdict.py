@@ -4,30 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, look, sight_of
+from worlds.scenes import Sight, sight_of
 
-from roadgeo.location import Location, Seconds
-from roadgeo.matching.estimator import MatchOptions
+from roadgeo.geometry.placement import Placement
 from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import Refined
-from roadgeo.matching.scene import Query
-from roadgeo.matching.verdict import place_frame
+from roadgeo.matching.verdict import georeference
 
 
-def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Location, np.ndarray]:
+def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Placement, np.ndarray]:
     """The place of a view whose corners are said to be so unsure, and the true corners in the CRS."""
     network, index = town
     truth, scene = sight_of(network, 5, tilt=tilt, sight=Sight(0.6))
     bent = truth + shaken_m * 1e-5 * np.array([[1.0, -2.0, 0.0], [1.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    sigmas, covariance = np.full(4, np.sqrt(2) * sigma_m), sigma_m**2 * np.eye(8)
-    place = Place(scene, index, bent, refined=Refined(bent, sigmas, 1.0, covariance), score=20.0)
+    place = Place(scene, index, bent, refined=Refined(bent, 1.0, sigma_m**2 * np.eye(8)), score=20.0)
     vars(place)["agreement"] = Agreement(0.9, 0.9)
-    query = Query("q", scene, look(network, truth), Seconds())
     corners = np.c_[scene.corners, np.ones(4)] @ truth.T
-    return place_frame(Location("q", "located", ""), query, place, MatchOptions()), index.plane.to_crs(
-        corners[:, :2] / corners[:, 2:]
-    )
+    return georeference(place), index.plane.to_crs(corners[:, :2] / corners[:, 2:])
 
 
 def test_a_view_straight_down_is_levelled_and_its_corners_are_surer(town):

@@ -12,7 +12,9 @@ import resource, sys
 from pathlib import Path
 import cv2, numpy as np
 from roadgeo.errors import OutputError
-from roadgeo.location import Location
+from roadgeo.geometry.placement import Placement
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.location import Content, Location
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import output_paths
@@ -26,9 +28,8 @@ rng = np.random.default_rng(0)
 photo = folder.parent / "photo.tif"
 cv2.imwrite(str(photo), rng.integers(0, 255, (300, 400, 3), np.uint8))
 matrix = np.array([[1.0, 0, 500000], [0, -1.0, 4500000], [0, 0, 1]])
-corners = np.array([[0, 0], [400, 0], [400, 300], [0, 300]]) * (1, -1) + (500000.0, 4500000.0)
-location = Location("q", "located", "why", "r", crs="EPSG:32629", size=(400, 300), homography=matrix, footprint=corners,
-                    footprint_lonlat=corners, gsd_m=1.0)
+place = Placement((400, 300), LocalPlane("EPSG:32629", (0.0, 0.0)), matrix, reference="r")
+location = Location("q", "located", "why", "r", places=(place,), content=Content((400, 300)))
 mask = RoadMask(np.eye(300, 400, dtype=bool))
 subject = Subject(location, mask, output_paths(folder, "x"), ImageOptions(), photo, [], None)
 resource.setrlimit(resource.RLIMIT_FSIZE, (50, 50))

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
+from worlds.answers import moved, placed, sure_to, with_place
 
 from roadgeo.errors import CrsError, MaskError, OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane
-from roadgeo.location import Evidence, Location, Place
+from roadgeo.geometry.placement import Matches
+from roadgeo.location import Content, Location
 from roadgeo.outputs.footprint import GROUND, OUTSIDE, ROAD
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.orthophoto import ImageOptions
-from roadgeo.outputs.paths import Placement, output_paths
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.placing import placement_of
 from roadgeo.outputs.registry import OVERLAY, STYLE
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.geopackage import layer_names, read_layer
@@ -28,34 +31,24 @@ TILT = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0002, -0.0003, 1.0]])
 
 
 def located(H: np.ndarray = TURN @ TILT) -> Location:
-    mask = road_mask()
-    to_crs = Homography(H)
     pixels = np.array([[50.5, 60.5], [200.0, 150.0], [350.0, 20.0]])
-    mapped = to_crs(pixels)
+    mapped = Homography(H)(pixels)
     graph = RoadGraph.from_polylines(
         pixel_to_plane(pixels), np.array([[0, 1], [1, 2]]), [pixel_to_plane(pixels[:2]), pixel_to_plane(pixels[1:])]
     )
     shift = np.array([[0.3, 0.4], [0.0, 0.0], [-0.6, 0.8]])
+    matches = Matches(pixel_to_plane(pixels), mapped + shift, np.hypot(*shift.T))
+    place = placed(
+        H, CRS, score=40.0, reference="porto", corner_covariance_m2=sure_to(0.5, 0.6, 0.7, 0.8), matches=matches
+    )
     return Location(
         query="photo_mask.png",
         status="located",
         reason="found",
         reference="porto",
         attribution="© somebody",
-        crs=CRS,
-        size=(400, 300),
-        homography=H,
-        footprint=to_crs(mask.corners),
-        footprint_lonlat=np.zeros((4, 2)),
-        center=Place(531100.0, 4556000.0, -8.6, 41.1, 40.0),
-        gsd_m=0.8,
-        rotation_deg=30.0,
-        corner_sigma_m=np.array([0.5, 0.6, 0.7, 0.8]),
-        n_intersections=5,
-        n_matched=3,
-        inlier_ratio=0.6,
-        log10_odds=40.0,
-        evidence=Evidence(graph, pixel_to_plane(pixels), mapped + shift, np.hypot(*shift.T)),
+        places=(place,),
+        content=Content((400, 300), graph, np.zeros((5, 2))),
     )
 
 
@@ -129,9 +122,9 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
     np.testing.assert_allclose(rings[0][:4], location.footprint)
     assert attributes["query"] == ["photo_mask.png"]
     assert attributes["attribution"] == ["© somebody"]
-    assert attributes["max_corner_sigma_m"] == [0.8]
+    assert attributes["max_corner_sigma_m"] == pytest.approx([0.8])
     points, matches = read_layer(paths.geopackage, "matches")
-    np.testing.assert_allclose(points, location.evidence.reference_xy)
+    np.testing.assert_allclose(points, location.place.matches.reference_xy)
     np.testing.assert_allclose(matches["residual_m"], [0.5, 0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(matches["dx_m"], [0.3, 0.0, -0.6], atol=1e-6)
     assert (matches["column"][0], matches["row"][0]) == (50.5, 60.5)
@@ -144,15 +137,16 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
 def test_the_geopackage_holds_other_places_and_how_sure_the_corners_are(tmp_path: Path) -> None:
     paths = output_paths(tmp_path, "a")
     covariance = np.kron(np.diag([1.0, 2.0, 3.0, 4.0]), [[1.0, 0.5], [0.5, 2.0]])
-    others = (Place(530000.0, 4555000.0, -8.7, 41.0, 3.5), Place(530001.0, 4555002.0, -8.6, 41.2, 1.5))
-    location = replace(located(), corner_covariance_m2=covariance, alternatives=others)
+    location = with_place(located(), corner_covariance_m2=covariance)
+    others = (moved(location.place, -1000.0, 20.0, score=3.5), moved(location.place, 0.0, 500.0, score=1.5))
+    location = replace(location, places=(*location.places, *others))
     write_location(location, road_mask(), paths)
     points, corners = read_layer(paths.geopackage, "corners")
     np.testing.assert_allclose(points, location.footprint)
     assert corners["var_y_m2"] == [2.0, 4.0, 6.0, 8.0]
     assert corners["cov_xy_m2"] == [0.5, 1.0, 1.5, 2.0]
     points, places = read_layer(paths.geopackage, "alternatives")
-    np.testing.assert_allclose(points, [(530000.0, 4555000.0), (530001.0, 4555002.0)])
+    np.testing.assert_allclose(np.array(points) - location.center[:2], [(-1000.0, 20.0), (0.0, 500.0)], atol=1e-6)
     assert (places["rank"], places["log10_odds"]) == ([2, 3], [3.5, 1.5])
     document = json.loads(paths.json.read_text())
     assert document["corner_covariance_m2"] == covariance.tolist()
@@ -212,7 +206,7 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot write"):
         write_location(located(), road_mask(), output_paths(tmp_path / "missing", "a"))
     with pytest.raises(OutputError, match="no place"):
-        Placement.of(Location("a.png", "not_located", "nothing fits"))
+        placement_of(Location("a.png", "not_located", "nothing fits"))
 
 
 @pytest.mark.parametrize(

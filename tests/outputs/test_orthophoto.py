@@ -22,9 +22,8 @@ from roadgeo.outputs.orthophoto import (
     read_preview,
     warp_image,
 )
-from roadgeo.outputs.paths import Placement
 
-PLACE = Placement.of(located())
+PLACE = located().places[0]
 MASK_SIZE = (400, 300)
 
 
@@ -270,7 +269,7 @@ def test_overviews_show_the_same_ground_and_no_dark_edge(tmp_path: Path, dtype: 
 @pytest.mark.parametrize("k1", [0.0, -0.08])
 @pytest.mark.parametrize("crs", [None, "EPSG:4326"])
 def test_where_pixels_come_from_is_as_good_as_exact(k1: float, crs: str | None) -> None:
-    place = replace(PLACE, homography=PLACE.homography @ np.array([[1, 0, 0], [0, 1, 0], [4e-4, -3e-4, 1]]), lens_k1=k1)
+    place = replace(PLACE, matrix=PLACE.matrix @ np.array([[1, 0, 0], [0, 1, 0], [4e-4, -3e-4, 1]]), lens_k1=k1)
     target = choose_target(place, ImageOptions(crs))
     grid = cover((1600, 1200), place.homography, None, 4_000_000, target.to_target)
     size, lens = (grid.width, grid.height), place.lens((1600, 1200))

@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 import pytest
 from outputs.test_location_files import CRS, located, road_mask
+from worlds.answers import with_place
 
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.location import Location, Seen
+from roadgeo.location import Content, Location
 from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.overlay import MAP_PX, MASK_SHARE, draw_overlay, write_overlay
@@ -42,7 +43,7 @@ def city() -> SimpleNamespace:
 def shown(location: Location | None = None, mask: RoadMask | None = None, photo: Path | None = None) -> Subject:
     """What outputs show, on that map."""
     scene, graph = trace_query(road_mask())
-    location = replace(location or located(), seen=Seen(graph, scene.intersections.xy))
+    location = replace(location or located(), content=Content(scene.size, graph, scene.intersections.xy))
     return Subject(location, mask or road_mask(), output_paths("", "a"), photo=photo, indexes=[city()])
 
 
@@ -72,7 +73,7 @@ def test_a_long_footprint_still_makes_a_picture_of_bounded_size(stretch: tuple[f
 
 
 def test_a_location_without_evidence_is_drawn_without_matches() -> None:
-    picture = draw_overlay(shown(replace(located(), evidence=None)))
+    picture = draw_overlay(shown(with_place(located(), matches=None)))
     assert (picture == FRAME).all(axis=2).any()
     assert not (picture == MATCH).all(axis=2).any()
 
@@ -100,7 +101,7 @@ def test_nothing_is_drawn_over_the_title_or_the_legend(
 ) -> None:
     photo = photograph(tmp_path, shape, shape[1]) if with_photo else None
     mask = RoadMask(np.ones(shape, np.bool_))
-    picture = draw_overlay(shown(replace(located(), evidence=None), mask, photo))
+    picture = draw_overlay(shown(with_place(located(), matches=None), mask, photo))
     top, panel = round(MAP_PX * 0.075), round(MAP_PX * MASK_SHARE)
     for strip in (picture[:top], picture[-(top // 2) :, :panel]):
         for color in (FRAME, (10, 200, 30)):
@@ -113,7 +114,7 @@ def test_the_picture_is_written(tmp_path: Path) -> None:
     drawn = draw_overlay(shown())
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], drawn)
     with pytest.raises(OutputError, match="no place"):
-        draw_overlay(shown(replace(located(), homography=None)))
+        draw_overlay(shown(replace(located(), places=())))
 
 
 def test_a_plot_is_saved_as_its_name_tells(tmp_path: Path) -> None:

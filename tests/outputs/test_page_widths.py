@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from evaluation.test_report import answer, truth
 from outputs.test_report_pages import render_report, rival
+from pyproj import CRS
 from support.browser import Browser, browser
+from worlds.answers import with_place
 from worlds.demo import MASKS
 
 from roadgeo.evaluation.report import render_report as render_evaluation
@@ -17,7 +19,8 @@ from roadgeo.evaluation.scoring import evaluate
 from roadgeo.flights.report import Thumbnails, render_flight
 from roadgeo.flights.rows import Row
 from roadgeo.geometry.georeference import Georeference
-from roadgeo.location import Location, Place, Reason
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.location import Location, Reason
 from roadgeo.outputs.report import Entry, render_batch
 from roadgeo.outputs.report.verification import write_verification
 from roadgeo.reference.reference import open_reference
@@ -56,15 +59,19 @@ def pages(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         mask = elsewhere if location.query == LONG else drone
         drawn[state] = render_report(location, mask, index, "© OpenStreetMap contributors", **given)
 
-    best = Place(531000.0, 4556000.0, -8.6, 41.1, -13.3)
     report("located", found)
     report("photograph", found, picture=photo)
     report("runner-up", rival(found))
     report("two places", replace(rival(found), status="ambiguous", reason_code=Reason.TWO_PLACES))
     report("half a place", replace(found, status="ambiguous", reason_code=Reason.HALF_A_PLACE))
-    report("own plane", replace(found, crs=f"PROJCRS[{LONG}]"))
-    report("refused", replace(refused, alternatives=(best,)))
-    report("refused without a best", replace(refused, alternatives=(), n_intersections=3))
+    report(
+        "own plane",
+        with_place(
+            found, plane=LocalPlane(CRS("+proj=sterea +lat_0=41 +lon_0=-8.6").to_wkt(), found.place.plane.origin)
+        ),
+    )
+    report("refused", replace(refused, places=refused.places[:1]))
+    report("refused without a best", replace(refused, places=(), content=replace(refused.content, xy=np.zeros((3, 2)))))
     report("several maps", replace(refused, reference=f"porto, {LONG}"))
     error = {"query": LONG, "status": "error", "reason": f"{LONG}: no such file"}
     entries = [Entry(item, "a.html") for item in (found.to_dict(), refused.to_dict(), error)]

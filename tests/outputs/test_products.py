@@ -2,7 +2,6 @@ import csv
 import json
 import xml.etree.ElementTree as ET
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,9 +10,11 @@ import pyproj
 import pytest
 import rasterio
 from outputs.test_location_files import located, road_mask
+from worlds.answers import with_place
 from worlds.turned import save_turned
 
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Location
 from roadgeo.outputs.kmz import write_kmz
 from roadgeo.outputs.location_files import OutputOptions, write_location
@@ -45,7 +46,7 @@ def photo_homography() -> Homography:
 def test_the_matches_are_told_with_their_residuals(written: OutputPaths) -> None:
     with (written.folder / "mask_matches.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    evidence = located().evidence
+    evidence = located().place.matches
     assert len(rows) == len(evidence.query_xy)
     pixels = np.array([(row["column"], row["row"]) for row in rows], float)
     np.testing.assert_allclose(pixels, 2 * evidence.query_xy * (1, -1), atol=1e-6)  # the photograph's, not the mask's
@@ -106,7 +107,7 @@ def test_programs_get_points_of_the_stored_pixels(tmp_path: Path, orientation: i
         right(fitted * (1, -1), rows[:, :2])
     with (tmp_path / "mask_matches.csv").open(encoding="utf-8") as file:
         pixels = [(float(row["column"]), float(row["row"])) for row in csv.DictReader(file)]
-    np.testing.assert_allclose(pixels, 2 * located().evidence.query_xy * (1, -1), atol=1e-6)  # of the upright picture
+    np.testing.assert_allclose(pixels, 2 * located().place.matches.query_xy * (1, -1), atol=1e-6)
 
 
 def test_names_that_opendronemap_does_not_take_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -198,7 +199,7 @@ def astride(tmp_path: Path) -> Subject:
     """A mask on the 180th meridian, in Fiji."""
     x, y = pyproj.Transformer.from_crs(4326, 32701, always_xy=True).transform(180.0, -16.8)
     H = np.array([[1.0, 0.0, x - 200.0], [0.0, -1.0, y + 150.0], [0.0, 0.0, 1.0]])
-    location: Location = replace(located(H), crs="EPSG:32701")
+    location: Location = with_place(located(H), plane=LocalPlane("EPSG:32701", located(H).place.plane.origin))
     return Subject(location, road_mask(), output_paths(tmp_path, "a"))
 
 

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from support.browser import Browser, Page, browser
+from worlds.answers import moved, with_place
 from worlds.demo import MASKS
 
 from roadgeo.cli import main
@@ -20,7 +21,8 @@ from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.demo import ATTRIBUTION
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
-from roadgeo.location import Evidence, Location, Place, Reason
+from roadgeo.geometry.placement import Matches
+from roadgeo.location import Location, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.outputs.location_files import OutputOptions, write_location
@@ -59,10 +61,8 @@ def found(porto: Reference, drone: RoadMask) -> Location:
 
 def rival(location: Location, dx: float = 400.0, dy: float = 400.0) -> Location:
     """The same with a runner-up somewhere else."""
-    center = location.center
-    assert center is not None
-    place = Place(center.x + dx, center.y + dy, center.lon + 0.004, center.lat + 0.004, 7.5)
-    return replace(location, log10_odds=8.5, runner_up=place)
+    assert location.place is not None
+    return with_place(location, score=8.5, rival=moved(location.place, dx, dy, score=7.5))
 
 
 def render_report(
@@ -145,9 +145,9 @@ def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) 
     assert 'data-frame="map"' not in page
     assert 'class="overview"' in page
     best = location.alternatives[0]
-    assert f'<a href="https://www.openstreetmap.org/?mlat={best.lat:.6f}' in page
+    assert f'<a href="https://www.openstreetmap.org/?mlat={best.center.lat:.6f}' in page
     assert "href" not in text
-    few = replace(location, n_intersections=4)
+    few = replace(location, content=replace(location.content, xy=np.zeros((4, 2))))
     assert "4 intersections are seen in the mask: few" in Reader(render_report(few, mask, porto.index)).text
 
 
@@ -166,7 +166,7 @@ def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Loc
     text = Reader(page).text
     assert "≈ ambiguous" in text
     assert "570 m to the north-east, 10^8 times less likely" in text
-    unsure = render_report(replace(location, log10_odds=-0.4), drone, porto.index)
+    unsure = render_report(with_place(location, score=-0.4), drone, porto.index)
     assert "to the north-east, about as likely" in Reader(unsure).text
     assert page.count('<g class="runner-up"') == 2  # around the footprint, and on the whole map
     far = render_report(rival(location, -30_000.0, 0.0), drone, porto.index)
@@ -177,30 +177,24 @@ def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Loc
 @pytest.mark.parametrize(
     "changes",
     [
-        {"evidence": None},
-        {"corner_sigma_m": None},
-        {"footprint_lonlat": None},
-        {"log10_odds": None, "tilt_deg": None, "tilt_source": None},
-        {"evidence": "empty"},
-        {"corner_sigma_m": np.full(4, np.nan)},
-        {"crs": "PROJCRS[...]"},
-        {"reference": "porto, lisbon"},
+        {"matches": None},
+        {"corner_covariance_m2": None},
+        {"score": np.nan, "is_pinhole": False},
+        {"matches": Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))},
+        {"corner_covariance_m2": np.full((8, 8), np.nan), "is_pinhole": False},
     ],
-    ids=lambda changes: next(iter(changes)),
+    ids=["matches", "accuracy", "score", "no matches", "no accuracy"],
 )
 def test_what_is_not_known_is_left_out(porto: Reference, drone: RoadMask, found: Location, changes: dict) -> None:
-    if changes.get("evidence") == "empty":
-        nothing = np.empty((0, 2))
-        assert found.evidence is not None
-        changes = {"evidence": Evidence(found.evidence.query_graph, nothing, nothing, np.empty(0))}
-    text = Reader(render_report(replace(found, **changes), drone, porto.index)).text
+    several = replace(with_place(found, **changes), reference="porto, lisbon")
+    text = Reader(render_report(several, drone, porto.index)).text
     assert "nan" not in text.replace("°", " ").lower().split()
     assert "None" not in text
 
 
 def test_names_are_text_and_nothing_else(porto: Reference, drone: RoadMask, found: Location) -> None:
     evil = '"><script>alert("x")</script>.png'
-    location = replace(found, query=evil, reference=evil, reason=evil, tilt_source=evil)
+    location = replace(found, query=evil, reference=evil, reason=evil)
     index = replace(porto.index, meta={**porto.index.meta, "name": evil, "sources": [{"name": evil}]})
     read = Reader(render_report(location, drone, index, evil))
     assert [tag for tag, _ in read.tags].count("script") == 1
@@ -232,7 +226,7 @@ def test_the_report_is_written_in_one_step(porto: Reference, drone: RoadMask, fo
 
 
 def test_many_masks_are_listed_with_their_reports(porto: Reference, found: Location) -> None:
-    elsewhere = replace(found, query="b/else&where.png", status="not_located", reason="no <place>", footprint=None)
+    elsewhere = replace(found, query="b/else&where.png", status="not_located", reason="no <place>")
     documents = [
         found.to_dict(),
         elsewhere.to_dict(),
@@ -291,11 +285,10 @@ def test_the_file_stays_small_whatever_is_shown(porto: Reference, found: Locatio
     mask = RoadMask(np.zeros((1000, 1000), bool), name="grid")
     mask.roads[3::10] = mask.roads[4::10] = True
     mask.roads[:, 3::10] = mask.roads[:, 4::10] = True
-    assert found.evidence is not None
     pixels = rng.uniform(0, 1000, (20_000, 2))
     at = Homography(found.homography)(pixels)
-    evidence = Evidence(found.evidence.query_graph, pixel_to_plane(pixels), at + 1.0, rng.uniform(0, 9, 20_000))
-    location = replace(found, evidence=evidence, size=(1000, 1000), n_matched=20_000)
+    matches = Matches(pixel_to_plane(pixels), at + 1.0, rng.uniform(0, 9, 20_000))
+    location = with_place(found, matches=matches, size=(1000, 1000))
     cv2.imwrite(str(tmp_path / "noise.png"), rng.integers(0, 255, (1800, 1800, 3), np.uint8))
     page = render_report(location, mask, index, picture=tmp_path / "noise.png")
     assert 1_000_000 < len(page.encode()) < MAX_BYTES
@@ -479,11 +472,10 @@ def test_a_match_is_chosen_in_both_views(browser: Browser, report: Path, found: 
         page.run("document.querySelector('.matches tbody button').click()")
         page.settle()
         assert [is_shown(page, ring) for ring in rings] == [True, True]
-        assert found.evidence is not None
         said = page.run("document.querySelector('.chosen-match').textContent")
-        assert said.startswith(f"Match 1: {found.evidence.residual_m.max():.2f} m apart")
+        assert said.startswith(f"Match 1: {found.place.matches.residual_m.max():.2f} m apart")
         # A click beside an intersection of the mask chooses the nearest.
-        worst = plane_to_pixel(found.evidence.query_xy)[np.argsort(-found.evidence.residual_m, kind="stable")]
+        worst = plane_to_pixel(found.place.matches.query_xy)[np.argsort(-found.place.matches.residual_m, kind="stable")]
         page.run("select(null)")
         assert [is_shown(page, ring) for ring in rings] == [False, False]
         x, y, unit = view(page, "aside .viewer")

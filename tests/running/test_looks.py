@@ -2,24 +2,22 @@
 
 import numpy as np
 import pytest
+from worlds.answers import moved, placed
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location, Place, Stats
+from roadgeo.location import Location, Spent, Stats
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running.looks import Seen, locate_looks
 
 OPTIONS = LocateOptions()
 MASK = RoadMask(np.eye(40, dtype=bool))
-SQUARE = np.array([[0, 1000], [1000, 1000], [1000, 0], [0, 0]], float)
+H = np.array([[2.0, 0.0, 500_000.0], [0.0, -2.0, 5_500_000.0], [0.0, 0.0, 1.0]])
 
 
-def found(status="located", odds=9.0, lon=10.0, seconds=1.0):
-    place = Place(500.0, 500.0, lon, 50.0, odds)
-    known = {"footprint": SQUARE, "center": place, "log10_odds": odds}
-    return Location(
-        "q", status, "why", stats=Stats(work_ms=round(1000 * seconds)), **(known if status != "not_located" else {})
-    )
+def found(status="located", odds=9.0, east_m=0.0, seconds=1.0):
+    places = () if status == "not_located" else (moved(placed(H, "EPSG:32632", score=odds), east_m, 0.0),)
+    return Location("q", status, "why", places=places, spent=Spent(stats=Stats(work_ms=round(1000 * seconds))))
 
 
 def take(*answers, options=OPTIONS):
@@ -52,7 +50,7 @@ def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
     location, limits = take(found("not_located"), MaskError("no road"), found(odds=9.0))
     assert location.status == "located"
     assert location.log10_odds == pytest.approx(9 - np.log10(3))
-    assert location.center.log10_odds == location.log10_odds
+    assert location.places[0].score == location.log10_odds
     assert "its roads were traced in 3 ways, here at look 2" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
 
@@ -61,7 +59,7 @@ def test_what_is_too_unlikely_for_a_second_look_is_refused():
     location, _ = take(MaskError("no road"), found(odds=OPTIONS.min_log10_odds + 0.2))
     assert location.status == "not_located"
     assert location.center is None
-    assert location.log10_odds is None
+    assert location.log10_odds < OPTIONS.min_log10_odds
     assert "not clearly enough" in location.reason
 
 
@@ -72,9 +70,10 @@ def test_no_look_is_taken_when_the_time_is_gone():
 
 
 def test_two_looks_at_two_places_are_ambiguous():
-    location, _ = take(found("ambiguous", odds=10.0, lon=10.5), found(odds=9.0))
+    location, _ = take(found("ambiguous", odds=10.0, east_m=30_000.0), found(odds=9.0))
     assert location.status == "ambiguous"
-    assert location.runner_up.lon == 10.5
+    assert location.runner_up.center.x == pytest.approx(location.center.x + 30_000.0)
+    assert location.alternatives == (location.runner_up,)
     same, _ = take(found("ambiguous", odds=10.0), found(odds=9.0))
     assert same.status == "located"
 

@@ -51,8 +51,8 @@ def test_a_stretched_scan_is_located_where_its_pixels_are_given(drawn, stretch):
     assert location.camera is None
     gaps = corners_of(location, scan.shape) - truth_of(truth)
     assert np.hypot(*gaps.T).max() < 4.0
-    placed = Homography(location.homography)(location.evidence.query_xy * (1.0, -1.0))
-    assert np.median(np.hypot(*(placed - location.evidence.reference_xy).T)) < 4.0
+    placed = Homography(location.homography)(location.place.matches.query_xy * (1.0, -1.0))
+    assert np.median(np.hypot(*(placed - location.place.matches.reference_xy).T)) < 4.0
 
 
 def test_a_sheet_is_located_by_its_map(drawn):

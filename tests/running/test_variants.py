@@ -28,22 +28,21 @@ def test_corners_stay_where_they_are(located, factor):
     assert own.size == size
     corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], float)
     assert np.allclose(Homography(own.homography)(corners), located.footprint)
-    assert np.allclose(own.evidence.query_xy, located.evidence.query_xy * scale)
-    assert np.allclose(own.evidence.query_graph.coords, located.evidence.query_graph.coords * scale)
-    assert np.allclose(own.seen.xy, located.seen.xy * scale)
+    assert np.allclose(own.place.matches.query_xy, located.place.matches.query_xy * scale)
+    assert np.allclose(own.content.graph.coords, located.content.graph.coords * scale)
+    assert np.allclose(own.content.xy, located.content.xy * scale)
     assert own.gsd_m == pytest.approx(located.gsd_m / np.sqrt(scale.prod()))
     assert own.camera.focal_px == pytest.approx(located.camera.focal_px * np.sqrt(scale.prod()))
     for name in ("footprint", "corner_sigma_m", "tilt_deg", "rotation_deg", "log10_odds", "n_intersections"):
-        assert np.array_equal(getattr(own, name), getattr(located, name))
+        assert getattr(own, name) == pytest.approx(getattr(located, name), rel=1e-6)
 
 
 def test_what_has_no_place_has_none_on_another_grid(located):
-    bare = replace(located, homography=None, camera=None, seen=None, evidence=None, gsd_m=None)
-    own = in_pixels_of(bare, (10, 10), np.eye(3))
+    own = in_pixels_of(replace(located, places=()), (10, 10), np.eye(3))
     assert own.size == (10, 10)
     assert own.homography is None
-    nothing = replace(located, size=None)
-    assert in_pixels_of(nothing, (10, 10), np.eye(3)) is nothing
+    nothing = replace(located, content=None, places=())
+    assert in_pixels_of(nothing, (10, 10), np.eye(3)) == nothing
 
 
 def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
@@ -53,8 +52,8 @@ def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
     assert (turned.camera, turned.tilt_deg) == (None, None)
     assert np.allclose(turned.footprint, located.footprint[[1, 0, 3, 2]])
     assert np.allclose(turned.corner_sigma_m, located.corner_sigma_m[[1, 0, 3, 2]])
-    placed = Homography(turned.homography)(turned.evidence.query_xy * (1.0, -1.0))
-    assert np.allclose(placed, Homography(located.homography)(located.evidence.query_xy * (1.0, -1.0)))
+    placed = Homography(turned.homography)(turned.place.matches.query_xy * (1.0, -1.0))
+    assert np.allclose(placed, Homography(located.homography)(located.place.matches.query_xy * (1.0, -1.0)))
     again = in_pixels_of(turned, located.size, variant.matrix)
     assert not again.mirrored
     assert np.allclose(again.corner_covariance_m2, located.corner_covariance_m2)

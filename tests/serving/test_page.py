@@ -14,9 +14,10 @@ import pytest
 from playwright.sync_api import expect, sync_playwright
 from serving.test_server import Workers, running
 from support.browser import find_chromium
+from worlds.answers import moved
 
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.location import Location, Place, Reason
+from roadgeo.location import Reason
 from roadgeo.reference.reference import Reference
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
@@ -116,11 +117,11 @@ def hard(monkeypatch):
         if options.near is not None or options.match.within is not None:
             return found
         if "hard" in mask.name:
-            refused = Location(mask.name, "not_located", "no place stands out", "town", seen=found.seen)
-            return replace(refused, size=found.size, reason_code=Reason.NOTHING_STANDS_OUT)
+            return replace(found, status="not_located", reason="no place stands out", places=())
         if "twins" in mask.name:
-            twin = Place(found.center.x + 900, found.center.y, found.center.lon + 0.01, found.center.lat, 5.0)
-            return replace(found, status="ambiguous", reason="two places fit", runner_up=twin, alternatives=(twin,))
+            twin = moved(found.place, 900.0, 0.0, score=5.0)
+            places = (replace(found.place, rival=twin), twin)
+            return replace(found, status="ambiguous", reason="two places fit", places=places)
         return found
 
     monkeypatch.setattr("roadgeo.workflows.locate", judge)
@@ -242,14 +243,13 @@ def test_a_refusal_is_helped_by_a_circle(page, served, hard):
 
 
 def test_one_of_two_places_is_chosen(page, served, hard):
-    _, workers, mask, lonlat = served
+    _, workers, mask, _ = served
     give(page, mask, "twins.png")
     wait_for(page, "Two places")
     expect(page.locator("#map .pin.place")).to_have_count(2)
     page.click("#places li:first-child button")
-    wait_for(page, "Located")
-    assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=1e-4)
-    assert workers.asked[-1].hints["near"][2] < 450
+    wait_for(page, "Chosen by you")
+    assert workers.asked[-1].hints["take"] == 1
 
 
 def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
@@ -258,9 +258,8 @@ def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
 
     def refuse(mask, references, options):
         found = locate(mask, references, options)
-        places = (found.places[0], replace(found.places[0], log10_odds=-1.0))
-        refused = Location(mask.name, "not_located", "no place", "town", seen=found.seen, alternatives=places)
-        return replace(refused, size=found.size, reason_code=Reason.FEW_ROADS)
+        places = (found.place, moved(found.place, 900.0, 0.0, score=-1.0))
+        return replace(found, status="not_located", reason="no place", reason_code=Reason.FEW_ROADS, places=places)
 
     monkeypatch.setattr("roadgeo.workflows.locate", refuse)
     give(page, mask, "far.png")

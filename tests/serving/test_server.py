@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
+from roadgeo.location import Content, Location
 from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Sighting
 from roadgeo.serving.app import Service
@@ -30,7 +30,7 @@ from roadgeo.serving.workers import Answer, Full, _answer
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
-REFUSED = Location("photo.png", "not_located", "hardly a road", size=(60, 40))
+REFUSED = Location("photo.png", "not_located", "hardly a road", content=Content((60, 40)))
 SEEN_ROADS = ProbabilityMap(np.full((40, 60), 9, np.uint8))
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}
 

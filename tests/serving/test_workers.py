@@ -29,7 +29,7 @@ from roadgeo.cli import main
 from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
+from roadgeo.location import Content, Location
 from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.running.looks import Sighting
 from roadgeo.running.pool import Died
@@ -200,7 +200,7 @@ def test_the_roads_of_a_photograph_are_found_once(tmp_path, town, monkeypatch):
     def locate_query(path, *_, **__):
         asked_of.append(Path(path).name)
         seen = ProbabilityMap(np.full((40, 60), 9, np.uint8))
-        refused = Location("photo.png", "not_located", "hardly a road", size=(60, 40))
+        refused = Location("photo.png", "not_located", "hardly a road", content=Content((60, 40)))
         return Sighting(refused, RoadMask(np.zeros((40, 60), bool)), probability=seen, of_photograph=True)
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)

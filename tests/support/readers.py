@@ -30,12 +30,13 @@ from roadgeo.flights.frames import FrameOptions, _video
 from roadgeo.flights.motion import read_motion
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
 from roadgeo.matching.hints import HINTS
+from roadgeo.outputs.location_document import read_location
 from roadgeo.reference import index_file
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.inspection import _describe_shards
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import open_shards
-from roadgeo.running.applying import apply_location, read_location
+from roadgeo.running.applying import apply_location
 from roadgeo.serving.requests import ending_of, read_query_string
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length

@@ -25,6 +25,7 @@ from roadgeo.outputs.drawing.layers import (
     rgb,
 )
 from roadgeo.outputs.drawing.svg import join_segments, thin_lines
+from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import write_sigma
 
@@ -215,7 +216,8 @@ def map_layer(index: ReferenceIndex, window: Window, wide: Window, max_vertices:
 def _picture_on_map(subject: Subject, window: Window) -> list[Layer]:
     """Return the photograph, or the mask's roads, warped to where it lies; nothing where that cannot be drawn."""
     image, is_photograph = draw_picture(subject, rgb("query")), subject.photo is not None
-    warped, grid = subject.place.draw(image, subject.mask_size, subject.views.picture_px**2, smooth=is_photograph)
+    max_pixels = subject.views.picture_px**2
+    warped, grid = warp_picture(subject.place, image, subject.mask_size, max_pixels, smooth=is_photograph)
     if grid.width == 0:
         return []
     x, y = window.place(np.array([grid.west, grid.north])).tolist()

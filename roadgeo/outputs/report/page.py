@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from roadgeo import __version__
 from roadgeo._text import counted
+from roadgeo._version import __version__
 from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.placement import Center, Placement
 from roadgeo.geometry.projection import transform
-from roadgeo.location import Location, Place, Reason
+from roadgeo.location import Location, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import Cross, Layer, Ring
 from roadgeo.outputs.drawing.svg import draw_layer, stylesheet
@@ -187,10 +188,10 @@ def _window(subject: Subject) -> Window:
 
 def _arrow_scale(location: Location) -> float:
     """Screen pixels for a metre of residual, or of a corner's circle."""
-    evidence, sigma = location.evidence, location.corner_sigma_m
+    matches, sigma = location.place and location.place.matches, location.corner_sigma_m
     scales = [1000.0]
-    if evidence is not None and len(evidence.residual_m):
-        scales.append(_ARROW_PX / max(float(np.percentile(evidence.residual_m, 90)), 1e-3))
+    if matches:
+        scales.append(_ARROW_PX / max(float(np.percentile(matches.residual_m, 90)), 1e-3))
     if sigma is not None and np.isfinite(sigma).any():
         scales.append(_CIRCLE_PX / max(SIGMAS * float(np.nanmax(sigma)), 1e-3))
     return min(scales)
@@ -205,8 +206,8 @@ def _draw_overview(subject: Subject) -> str:
     layers = [picture]
     if subject.has_place:
         layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
-    known = [place.footprint_lonlat for place in location.alternatives if place.footprint_lonlat is not None]
-    grounds = [transform("EPSG:4326", index.plane.crs, np.array(ring)) for ring in known]
+    rings = [place.footprint_lonlat for place in location.alternatives]
+    grounds = [transform("EPSG:4326", index.plane.crs, ring) for ring in rings]
     others: list[Cross | Ring] = [Ring(window.place(ground)) for ground in grounds if np.isfinite(ground).all()]
     middle = subject.runner_up()
     if middle is not None:
@@ -267,12 +268,14 @@ def _advice(subject: Subject) -> list[str]:
     ]
 
 
-def _listed(places: Sequence[Place]) -> str:
+def _listed(places: Sequence[Placement]) -> str:
     """List the best places of a refusal with their scores: HTML."""
     if not places:
         return ""
-    scores = [min(place.log10_odds, places[0].log10_odds) for place in places]
-    lines = [f"{n}. {_link(places[n - 1])} <small>score {score:.1f}</small>" for n, score in enumerate(scores, 1)]
+    scores = [min(place.score, places[0].score) for place in places]
+    lines = [
+        f"{n}. {_link(places[n - 1].center)} <small>score {score:.1f}</small>" for n, score in enumerate(scores, 1)
+    ]
     return "<br>".join(["The best places that it had, though not sure enough:", *lines, _TAKING])
 
 
@@ -283,10 +286,11 @@ def _rival(location: Location) -> str:
         return ""
     if other is None:
         return "No other place came close."
-    apart = math.hypot(other.x - center.x, other.y - center.y)
-    wind = _WINDS[round(math.degrees(math.atan2(other.x - center.x, other.y - center.y)) / 45.0) % 8]
+    x, y = other.center_in(str(location.crs))[:2]
+    apart = math.hypot(x - center.x, y - center.y)
+    wind = _WINDS[round(math.degrees(math.atan2(x - center.x, y - center.y)) / 45.0) % 8]
     way = f"{write_distance(apart)} to the {wind}"
-    return f"The best other place lies {way}, {write_lead(location.log10_odds)}: {_link(other)}"
+    return f"The best other place lies {way}, {write_lead(location.log10_odds)}: {_link(other.center)}"
 
 
 def _sentence(text: str) -> str:
@@ -319,8 +323,8 @@ def _numbers(subject: Subject) -> list[tuple[str, str]]:
     # Support.
     matched = f"{location.n_matched} of {location.n_intersections} matched"
     rows.append(("Intersections", matched if place else f"{location.n_intersections} seen"))
-    if location.evidence is not None and len(location.evidence.residual_m):
-        middle, worst = np.percentile(location.evidence.residual_m, (50, 100))
+    if place is not None and place.matches:
+        middle, worst = np.percentile(place.matches.residual_m, (50, 100))
         rows.append(("Residuals", f"median {write_distance(middle)}, largest {write_distance(worst)}"))
     if location.log10_odds is not None:
         rows.append(("Score", f"{location.log10_odds:z.1f} <small>(powers of ten ahead of any other place)</small>"))
@@ -328,7 +332,7 @@ def _numbers(subject: Subject) -> list[tuple[str, str]]:
     return rows
 
 
-def _link(place: Place) -> str:
+def _link(place: Center) -> str:
     """Give a place in degrees, with a link to a map of it, and in the CRS."""
     url = f"https://www.openstreetmap.org/?mlat={place.lat:.6f}&mlon={place.lon:.6f}#map=16/{place.lat:.5f}/{place.lon:.5f}"
     where = f'<a href="{html.escape(url)}" rel="noreferrer">{format_lonlat(place.lon, place.lat)}</a>'

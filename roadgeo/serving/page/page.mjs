@@ -273,12 +273,8 @@ function showPlaces(entry) {
     offer((found?.alternatives ?? []).map(({ center }) => center), "Take it", (i) => again(entry, { ...entry.hints, take: i + 1 }));
   }
   if (status !== "ambiguous") return;
-  const side = found.gsd_m * Math.max(...found.size);
   const places = [found.center, ...found.alternatives.map((one) => one.center)].slice(0, 6);
-  offer(places, "It is this one", (i) => {
-    const lonlat = [places[i].lon, places[i].lat];
-    again(entry, { ...entry.hints, near: [...lonlat, radius(lonlat, places, side)] });
-  });
+  offer(places, "It is this one", (i) => again(entry, { ...entry.hints, take: i + 1 }));
 }
 
 /** Show places by letters, on the map and in a list with a button each. */
@@ -289,12 +285,6 @@ function offer(places, words, choosePlace) {
     const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `${words}: ${degrees(place)}`);
     return make("li", {}, there);
   }));
-}
-
-/** A circle around one place that holds none of the others. */
-function radius(lonlat, places, side) {
-  const apart = places.map(({ lon, lat }) => Math.hypot(...view.metres(lonlat, [lon, lat]))).filter((m) => m > 1);
-  return Math.min(0.4 * side, 0.45 * Math.min(...apart));
 }
 
 function showSession() {
