@@ -16,6 +16,7 @@ from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.location import Seen
 from roadgeo.matching.explanation import Explanation, Story, Told
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
@@ -112,8 +113,9 @@ def draw_explanation(subject: Subject) -> AnyArray:
 def _draw_seen(subject: Subject, explanation: Explanation) -> list[AnyArray]:
     """Draw the mask, its traced roads and its intersections, and a line of numbers."""
     scene = explanation.scene
-    roads = Lines([plane_to_pixel(road) for road in explanation.graph.polylines()])
-    crossings = plane_to_pixel(scene.intersections.xy)
+    seen = subject.location.seen or Seen(explanation.graph, scene.intersections.xy)  # in the mask's own pixels
+    roads = Lines([plane_to_pixel(road) for road in seen.graph.polylines()])
+    crossings = plane_to_pixel(seen.xy)
     canvas = Canvas.of(subject.box, _MASK, _MASK)
     canvas.draw([mask_layer(subject), Layer("query-roads", "", [roads]), Layer("matches", "", [Dots(crossings)])])
     unseen_share = 1.0 - float(scene.observed.mean())

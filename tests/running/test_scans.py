@@ -11,6 +11,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
+from roadgeo.workflows import explain
 
 pytestmark = pytest.mark.slow
 
@@ -53,6 +54,15 @@ def test_a_stretched_scan_is_located_where_its_pixels_are_given(drawn, stretch):
     assert np.hypot(*gaps.T).max() < 4.0
     placed = Homography(location.homography)(location.place.matches.query_xy * (1.0, -1.0))
     assert np.median(np.hypot(*(placed - location.place.matches.reference_xy).T)) < 4.0
+
+
+def test_an_explanation_of_a_stretched_scan_shows_its_roads_on_the_scan(drawn):
+    reference, mask, _ = drawn
+    scan = cv2.resize(mask, (400, 700), interpolation=cv2.INTER_AREA)
+    sighting = locate_query(scan, [reference], reading=ReadOptions(aspect=1.75), how=explain)
+    seen, traced = sighting.location.seen, sighting.explanation.scene.intersections
+    assert len(seen.xy) == len(traced.xy) > 20
+    assert np.ptp(seen.xy[:, 0]) < 400 < np.ptp(traced.xy[:, 0])
 
 
 def test_a_sheet_is_located_by_its_map(drawn):
