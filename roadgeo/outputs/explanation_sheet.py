@@ -16,7 +16,6 @@ from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
-from roadgeo.location import Seen
 from roadgeo.matching.explanation import Explanation, Story, Told
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
@@ -113,9 +112,11 @@ def draw_explanation(subject: Subject) -> AnyArray:
 def _draw_seen(subject: Subject, explanation: Explanation) -> list[AnyArray]:
     """Draw the mask, its traced roads and its intersections, and a line of numbers."""
     scene = explanation.scene
-    seen = subject.location.seen or Seen(explanation.graph, scene.intersections.xy)  # in the mask's own pixels
-    roads = Lines([plane_to_pixel(road) for road in seen.graph.polylines()])
-    crossings = plane_to_pixel(seen.xy)
+    content = subject.location.content  # in the mask's own pixels, which may not be those of the search
+    graph, xy = explanation.graph, scene.intersections.xy
+    graph, xy = (graph, xy) if content is None or content.graph is None else (content.graph, content.xy)
+    roads = Lines([plane_to_pixel(road) for road in graph.polylines()])
+    crossings = plane_to_pixel(xy)
     canvas = Canvas.of(subject.box, _MASK, _MASK)
     canvas.draw([mask_layer(subject), Layer("query-roads", "", [roads]), Layer("matches", "", [Dots(crossings)])])
     unseen_share = 1.0 - float(scene.observed.mean())

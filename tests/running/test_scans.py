@@ -60,7 +60,7 @@ def test_an_explanation_of_a_stretched_scan_shows_its_roads_on_the_scan(drawn):
     reference, mask, _ = drawn
     scan = cv2.resize(mask, (400, 700), interpolation=cv2.INTER_AREA)
     sighting = locate_query(scan, [reference], reading=ReadOptions(aspect=1.75), how=explain)
-    seen, traced = sighting.location.seen, sighting.explanation.scene.intersections
+    seen, traced = sighting.location.content, sighting.explanation.scene.intersections
     assert len(seen.xy) == len(traced.xy) > 20
     assert np.ptp(seen.xy[:, 0]) < 400 < np.ptp(traced.xy[:, 0])
 
