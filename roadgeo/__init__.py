@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from roadgeo._version import __version__
 
 if TYPE_CHECKING:
-    from roadgeo.api import Answer, index, locate, track, vectorize, verify
+    from roadgeo.api import Answer, fence, index, locate, track, vectorize, verify
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
@@ -39,6 +39,7 @@ __all__ = [
     "ShardedReference",
     "__version__",
     "explain",
+    "fence",
     "index",
     "locate",
     "open_reference",
@@ -58,6 +59,7 @@ _HOMES = {
     "RoadgeoError": "errors",
     "ShardedReference": "reference.shards",
     "explain": "workflows",
+    "fence": "api",
     "index": "api",
     "locate": "api",
     "open_reference": "reference.reference",

@@ -28,10 +28,50 @@ if TYPE_CHECKING:
     from roadgeo.flights.rows import Row
     from roadgeo.running.verifying import Verified
 
-__all__ = ["Answer", "index", "locate", "track", "vectorize", "verify"]
+__all__ = ["Answer", "fence", "index", "locate", "track", "vectorize", "verify"]
 
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
+
+#: A file or folder, or several.
+Files: TypeAlias = "str | os.PathLike[str] | Iterable[str | os.PathLike[str]]"
+
+
+def fence(read: Files = (), write: Files = (), *, network: bool = False) -> bool:
+    """Fence this process in, for good: from now on it opens what is given here, and nothing else.
+
+    Commands do so by themselves; a program that reads files of strangers may. Python, its packages, the system's
+    libraries, the library of references and the cache stay readable. Threads that run already stay outside, processes
+    that start later are inside.
+
+    >>> roadgeo.fence(read=["photo.jpg", "porto.gpkg"], write=["found"])  # doctest: +SKIP
+    True
+
+    Parameters
+    ----------
+    read : path or paths
+        Files, with those beside them that share their stem; folders, with all that is in them.
+    write : path or paths
+        Folders that may be written, and read; they are made if they are missing.
+    network : bool
+        Whether connections may be made, where the system can forbid them (Linux 6.7 and later).
+
+    Returns
+    -------
+    bool
+        Whether there is a fence: False where the system has no Landlock (Linux 5.13 and later).
+    """
+    from roadgeo.reference.library import library_dir
+    from roadgeo.storage.fence import Fence
+
+    kept = [str(library_dir())] if library_dir().is_dir() else []
+    kept.append("/dev/shm")  # noqa: S108 - where locks of several processes lie
+    return Fence(_paths(read), (), (*_paths(write), *kept), network).enter()
+
+
+def _paths(given: Files) -> tuple[str, ...]:
+    one = (given,) if isinstance(given, str | os.PathLike) else given
+    return tuple(os.fspath(path) for path in one)
 
 
 def index(

@@ -27,6 +27,7 @@ __all__ = [
     "RoadSourceError",
     "RoadgeoError",
     "how_to_install",
+    "is_of_memory",
     "name_package",
 ]
 
@@ -140,6 +141,17 @@ class PluginError(RoadgeoError):
     """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
 
     code = Reason.PLUGIN
+
+
+#: How libraries word that they were given no memory.
+_NO_MEMORY = re.compile(
+    r"out of memory|insufficient memory|no memory left|bad.?alloc|cannot allocate|unable to allocate", re.I
+)
+
+
+def is_of_memory(error: BaseException) -> bool:
+    """Whether an error, of whatever library, says that there is no memory left."""
+    return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
 
 
 def name_package(error: ModuleNotFoundError) -> MissingPackageError | None:

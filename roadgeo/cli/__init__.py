@@ -19,8 +19,10 @@ from typing import Any
 import click
 
 from roadgeo._version import __version__
+from roadgeo.cli.fencing import OWN_PROCESS
 from roadgeo.cli.printing import complain, echo
-from roadgeo.errors import RoadgeoError, name_package
+from roadgeo.errors import RoadgeoError, is_of_memory, name_package
+from roadgeo.storage.fence import remedy
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "Group", "cli", "main"]
@@ -158,7 +160,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     forget_missing_proj_data()
     try:
         status = cli.main(
-            args=None if arguments is None else list(arguments), prog_name="roadgeo", standalone_mode=False
+            args=None if arguments is None else list(arguments),
+            prog_name="roadgeo",
+            standalone_mode=False,
+            obj=OWN_PROCESS if arguments is None else None,
         )
     except click.UsageError as error:
         asked = error.ctx.command_path if error.ctx else "roadgeo"
@@ -183,7 +188,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if os.environ.get("ROADGEO_TRACEBACK"):
             raise
-        what = f"{type(error).__name__}: {error}"
+        if is_of_memory(error):
+            return _fail("more memory is needed than there is; take a smaller area or picture, or fewer --jobs", ERROR)
+        what = f"{type(error).__name__}: {error}{remedy(str(error))}"
         return _fail(f"{what}. This is a fault of roadgeo; ROADGEO_TRACEBACK=1 shows where, please report it", ERROR)
     return status if isinstance(status, int) else 0
 

@@ -120,7 +120,8 @@ def index_command(
         roads = read(source, given, say)
     compile_once(map_only=True)  # nobody waits for that whose roads cannot be read
     with show_steps() as say:
-        reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
+        reference = build_reference(roads, make_slug(name), COARSE if coarse else None, say=say)
+        reference.save(path, say)
     if is_set("verbose"):
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)

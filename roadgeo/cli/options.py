@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from roadgeo.cli.fencing import OWN_PROCESS, enter_fence
 from roadgeo.cli.printing import echo, keep_switch
 from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_place, read_range
+from roadgeo.storage.memory import MEMORY
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
@@ -109,11 +111,14 @@ class Command(Once):
     """A command whose help lists its options in groups, and leaves what is rarely wanted to --help-all.
 
     --help-all shows besides what stands in the help below a form feed, and `more`, below the options.
+
+    It runs inside a fence, unless it fences in others itself (`cli.fencing`).
     """
 
-    def __init__(self, *args: Any, more: str | Callable[[], str] = "", **settings: Any) -> None:
+    def __init__(self, *args: Any, more: str | Callable[[], str] = "", is_fenced: bool = True, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        self.more = more
+        self.more, self.is_fenced = more, is_fenced
+        self.params += _options_of_the_fence() if is_fenced else []
         self.is_long = (
             bool(more) or "\f" in (self.help or "") or any(getattr(param, "rare", False) for param in self.params)
         )
@@ -122,6 +127,12 @@ class Command(Once):
             self.params.append(
                 _Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=text)
             )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run it, fenced in where the process is ours."""
+        if ctx.obj is OWN_PROCESS and self.is_fenced:
+            enter_fence(str(self.name), ctx.params, ctx.meta.get(_ALLOWED, ()))
+        return super().invoke(ctx)
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write what the command does."""
@@ -165,6 +176,33 @@ def _show_all(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
         ctx.meta[_WHOLE] = True
         echo(ctx.get_help(), color=ctx.color)
         ctx.exit()
+
+
+#: Under which what --allow names is kept among what click's contexts share.
+_ALLOWED = "roadgeo.allowed"
+
+
+def _keep_allowed(ctx: click.Context, _: click.Parameter, paths: tuple[str, ...]) -> None:
+    ctx.meta[_ALLOWED] = paths
+
+
+def _keep_memory(_: click.Context, __: click.Parameter, most: float | None) -> None:
+    if most is not None:
+        os.environ[MEMORY] = f"{most:g}"  # for processes that are started, too
+
+
+def _options_of_the_fence() -> list[click.Parameter]:
+    """Make the options of all commands that read strangers' files."""
+    allow = "Also read what files name in this folder, as a virtual raster names others. Repeatable. Default: nothing."
+    memory = (
+        "Most memory that the reading of a file takes. Default: 1, and 100 times the file; at most half that is free."
+    )
+    more: dict[str, Any] = {"expose_value": False, "rare": True}
+    return [
+        _Option(["--allow"], metavar="FOLDER", type=click.Path(exists=True), multiple=True, callback=_keep_allowed,
+            help=allow, **more),
+        _Option(["--memory"], metavar="GB", type=click.FloatRange(0.1), callback=_keep_memory, help=memory, **more),
+    ]  # fmt: skip
 
 
 def row(names: str, shown: str | tuple[str, ...] | None, group: str, text: str, **more: Any) -> Callable[..., Any]:

@@ -10,7 +10,7 @@ import click
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, Group
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import OTHERS, Once, row, take
+from roadgeo.cli.options import OTHERS, Command, Once, row, take
 from roadgeo.cli.printing import complain, echo, is_set
 
 __all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
@@ -33,7 +33,7 @@ def reference_command() -> None:
     """
 
 
-@reference_command.command("info", cls=Once, short_help="Describe a reference.")
+@reference_command.command("info", cls=Command, short_help="Describe a reference.")
 @click.argument("reference", metavar="REF", type=click.Path(), required=False)
 @row("--plugins", "", OTHERS, "The same as `roadgeo --plugins`.", hidden=True)
 @take("json", help="Print everything that is known as one JSON object.")
@@ -81,7 +81,7 @@ def list_plugins() -> None:
         echo("  ".join([*(text.ljust(width) for text, width in zip(line, widths, strict=False)), line[3]]))
 
 
-@reference_command.command("check", cls=Once, short_help="Test whether the files of references are sound.")
+@reference_command.command("check", cls=Command, short_help="Test whether the files of references are sound.")
 @click.argument("references", metavar="REF...", nargs=-1, required=True, type=click.Path())
 def check_command(references: tuple[str, ...]) -> int:
     """Verify references thoroughly: all digests, all ranges, and that index and GeoPackage agree.
@@ -113,7 +113,7 @@ def check_command(references: tuple[str, ...]) -> int:
     return status
 
 
-@reference_command.command("list", cls=Once, short_help="List the references in the library.")
+@reference_command.command("list", cls=Command, short_help="List the references in the library.")
 @take("json", help="Print one JSON object per reference and line.")
 def list_command() -> int:
     """List the references in the library, which `roadgeo locate` searches without --reference.

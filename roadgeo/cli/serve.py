@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo.cli.fencing import fence_of
 from roadgeo.cli.options import OTHERS, Command, each, n_threads, open_maps, row, take
 from roadgeo.cli.printing import echo, is_set
 from roadgeo.matching.hints import HINTS
@@ -108,7 +109,9 @@ _OPTIONS = (
 )  # fmt: skip
 
 
-@click.command("serve", cls=Command, short_help="A page to drop photographs on; answers over HTTP.", help=_help())
+@click.command(
+    "serve", cls=Command, is_fenced=False, short_help="A page to drop photographs on; answers over HTTP.", help=_help()
+)
 @each(_OPTIONS)
 def serve_command(
     references: tuple[str, ...],
@@ -126,7 +129,9 @@ def serve_command(
     # Compiled and opened here first: errors in the references are printed before anything listens.
     options = _options(given)
     maps = open_maps(references)
-    workers = Workers(references, options.workers, options.waiting, n_threads(options.workers))
+    # The images of strangers are opened by processes inside a fence; this one may show the page in a browser.
+    fence = fence_of("serve", {"references": references}, ())
+    workers = Workers(references, options.workers, options.waiting, n_threads(options.workers), fence)
     try:
         sender = None if mavlink is None else MavlinkSender(mavlink)
         server = Server(Service(workers, maps, options, None if sender is None else partial(_tell, sender)))

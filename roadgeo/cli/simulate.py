@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import Once, take
+from roadgeo.cli.options import Command, take
 from roadgeo.cli.printing import tell
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
@@ -16,7 +16,7 @@ from roadgeo.cli.queries import query_options, query_sets
 __all__ = ["simulate_command"]
 
 
-@click.command("simulate", cls=Once, short_help="Draw road masks whose place is known.")
+@click.command("simulate", cls=Command, short_help="Draw road masks whose place is known.")
 @click.argument("reference", metavar="REF")
 @take("out_dir", help="Where to write.", default=None, required=True)
 @query_options

@@ -44,7 +44,7 @@ _HELP = """Follow a flight over the map, frame by frame.
 
 FRAMES overlap, each with the one before: masks of roads or photographs (files, folders or patterns, in order), or a
 video. One low frame shows too few roads to be located; so frames are laid together until the map knows them, and from
-there on each is followed from the one before, in some hundredths of a second. What does not agree with the map is said:
+there on each is followed from the one before. What does not agree with the map is said:
 
 \b
   located    placed by the search, with those that waited beside it

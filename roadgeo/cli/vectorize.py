@@ -40,7 +40,7 @@ def vectorize_command(
       roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
     """
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.errors import RoadgeoError
+    from roadgeo.errors import RoadgeoError, is_of_memory
 
     make_folder(out_dir)
     compile_once()
@@ -55,8 +55,9 @@ def vectorize_command(
                 status = ERROR
                 continue
             except Exception as error:  # of a library: nothing wrong with one mask stops the others
-                what = f"{task.mask}: {type(error).__name__}: {error}"
-                complain(f"{what}; this is a fault of roadgeo, please report it")
+                what = f"{task.mask}: {type(error).__name__}: {error}; this is a fault of roadgeo, please report it"
+                lack = f"{task.mask}: more memory is needed than there is; reduce it or cut it up"
+                complain(lack if is_of_memory(error) else what)
                 status = ERROR
                 continue
             echo(visible(f"{task.mask}: {seen}"))

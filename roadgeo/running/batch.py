@@ -20,13 +20,14 @@ import numpy as np
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import visible
-from roadgeo.errors import IndexFormatError, MaskError, Reason, RoadgeoError, name_package
+from roadgeo.errors import IndexFormatError, MaskError, Reason, RoadgeoError, is_of_memory, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.processes import run
 from roadgeo.running.tasks import Task
+from roadgeo.storage.fence import remedy
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
@@ -225,16 +226,16 @@ class Locating:
         except UnicodeEncodeError:  # libraries take no other names
             reason = f"{task.query}: its name is no text, or the picture's; rename it"
             return self.failed(task, Reason.INVALID, reason)
-        except MemoryError:
-            reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"
-            return self.failed(task, Reason.MEMORY, reason)
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
+            if is_of_memory(error):
+                reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"
+                return self.failed(task, Reason.MEMORY, reason)
             missing = name_package(error) if isinstance(error, ModuleNotFoundError) else None
             if missing is not None:
                 return self.failed(task, Reason.INVALID, f"{task.query}: {missing}")
-            what = " ".join(f"{type(error).__name__}: {error}".split())
+            what = " ".join(f"{type(error).__name__}: {error}{remedy(str(error))}".split())
             reason = f"{task.query}: {what}; this is a fault of roadgeo, please report it"
             return self.failed(task, Reason.FAULT, reason)
 

@@ -14,7 +14,7 @@ import pickle
 import threading
 import uuid
 from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +23,7 @@ from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
 from roadgeo.running.pool import Died, Pool, Work
 from roadgeo.running.processes import without_interrupts
+from roadgeo.storage.fence import Fence, current, is_started_inside
 from roadgeo.storage.folders import private_temporary_dir
 
 __all__ = ["Cluster", "DaskWorkers"]
@@ -165,37 +166,53 @@ class DaskWorkers:
 
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
-_prepared: dict[str, Any] = {}
+#: For each work, the thread that does it, and how.
+_prepared: dict[str, tuple[ThreadPoolExecutor, Any]] = {}
 
 
 @dataclass(frozen=True)
 class Made:
-    """Work on its way to the workers: a name for it, the folder that it was asked for in, and itself."""
+    """Work on its way to the workers: a name for it, the folder that it was asked for in, itself, and its fence."""
 
     token: str
     folder: str
     pickled: bytes
+    fence: Fence | None
 
     @classmethod
     def of(cls, work: Any) -> Made:
         """Wrap work that can be pickled."""
-        return cls(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work))
+        return cls(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work), current())
 
 
 def do_prepared(made: Made, task: Any) -> Any:
-    """Do a task in the folder where it was asked for; make its work and this worker ready first, once."""
+    """Do a task in the folder where it was asked for; make its work and this worker ready first, once.
+
+    A worker outlives the work. So a thread of its own does it, inside the fence of whoever asked.
+    """
     if made.token not in _prepared:
-        os.chdir(made.folder)
-        import cv2
+        for thread, _ in _prepared.values():  # of earlier runs, whose maps are no longer needed
+            thread.shutdown()
+        _prepared.clear()
+        thread = ThreadPoolExecutor(1)
+        _prepared[made.token] = thread, thread.submit(_prepare, made).result()
+    thread, do = _prepared[made.token]
+    return thread.submit(do, task).result()
 
-        from roadgeo.kernels.warmup import warm_up
 
-        cv2.setNumThreads(1)
-        with _one_of_host():
-            warm_up()
-        _prepared.clear()  # of earlier runs, whose maps are no longer needed
-        _prepared[made.token] = pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
-    return _prepared[made.token](task)
+def _prepare(made: Made) -> Any:
+    """Make work ready on the thread that will do it."""
+    os.chdir(made.folder)
+    if made.fence is not None and not is_started_inside():
+        made.fence.enter()
+    import cv2
+
+    from roadgeo.kernels.warmup import warm_up
+
+    cv2.setNumThreads(1)
+    with _one_of_host():
+        warm_up()
+    return pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from typing import Any, NoReturn, TypeVar
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
 from roadgeo.running.pool import Died, Ended, Pool, Ready, Work
+from roadgeo.storage import fence
 from roadgeo.storage.files import remove_own
 
 __all__ = ["Processes", "end_with_parent", "run", "tell", "without_interrupts"]
@@ -84,6 +85,7 @@ class Processes:
         *,
         grace_s: float = _GRACE_S,
         clean: Callable[[], None] | None = None,
+        within: fence.Fence | None = None,
     ) -> None:
         """Start them.
 
@@ -93,10 +95,12 @@ class Processes:
             Time for half-written files to be removed in the end.
         clean : callable, optional
             What they do where this process is killed.
+        within : Fence, optional
+            A fence that they enter; by default that of this process.
         """
         self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
         self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-        self.all = [_Process((work, clean)) for _ in range(count)]
+        self.all = [_Process((work, clean, within or fence.current())) for _ in range(count)]
         try:
             for process in self.all:
                 process.start()
@@ -234,12 +238,20 @@ def tell(text: str, share: float | None = None) -> None:
         pipe.send(("told", text, share))
 
 
-def _serve(pipe: Connection, level: int, work: Ready[Any, Any], clean: Callable[[], None] | None) -> None:
+def _serve(
+    pipe: Connection,
+    level: int,
+    work: Ready[Any, Any],
+    clean: Callable[[], None] | None,
+    within: fence.Fence | None = None,
+) -> None:
     """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
         end_with_parent(clean)
+        if within is not None and not fence.is_inside():  # the fork server may be older than the fence
+            within.enter()
         import cv2
 
         cv2.setNumThreads(1)  # the processes share the processors already

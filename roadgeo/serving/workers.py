@@ -11,7 +11,7 @@ import shutil
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,7 @@ from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
 from roadgeo.running.pool import Died, Ended, Lost, Pool
 from roadgeo.running.processes import Processes, tell
+from roadgeo.storage.fence import Fence
 
 __all__ = ["Answer", "Asked", "Full", "Serving", "Workers"]
 
@@ -100,8 +101,12 @@ class Workers:
         For images, until the processes are ended. If the server is killed they remove it.
     """
 
-    def __init__(self, references: Sequence[str], count: int, waiting: int, threads: int = 1) -> None:
-        """Start them; `waiting` more requests than there are processes may wait, and the network has `threads`.
+    def __init__(
+        self, references: Sequence[str], count: int, waiting: int, threads: int = 1, fence: Fence | None = None
+    ) -> None:
+        """Start them, each inside a fence.
+
+        `waiting` more requests than there are processes may wait, and the network has `threads`.
 
         Raises
         ------
@@ -111,7 +116,10 @@ class Workers:
         self._temporary = TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True)
         self.folder = Path(self._temporary.name)
         clean = partial(shutil.rmtree, self.folder, ignore_errors=True)
-        self._processes = Processes(Serving(tuple(references), threads), count, grace_s=0.0, clean=clean)
+        own = self._temporary.name
+        within = fence and replace(fence, write=(*fence.write, own), temporary=own)
+        work = Serving(tuple(references), threads)
+        self._processes = Processes(work, count, grace_s=0.0, clean=clean, within=within)
         self._pool = Pool[Asked, Answer](self._processes, again_alone=False)
         self._places = threading.Semaphore(count + waiting)
         try:
@@ -207,8 +215,6 @@ def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, thr
 
 
 def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> Answer:
-    from dataclasses import replace
-
     from roadgeo.matching.hints import apply_hints
     from roadgeo.running.choosing import take_place
     from roadgeo.running.options import ReadOptions

@@ -19,8 +19,7 @@ from roadgeo.errors import NoRoadsError, RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through, objects
 from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_ways
 from roadgeo.sources.schemas import is_known_column, names_kinds
-from roadgeo.storage.crs_guard import refuse_named_files
-from roadgeo.storage.unpacking import require_bounded
+from roadgeo.storage.memory import each_bounded
 from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
 
 __all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_missing"]
@@ -95,6 +94,18 @@ def stream_tables(
     RoadSourceError
         The file is unreadable, or which of its layers is meant is not known.
     """
+    yield from each_bounded(path, _stream(path, layer, most, advance, folder, areas=areas))
+
+
+def _stream(
+    path: Path,
+    layer: str | Sequence[str] | None,
+    most: int,
+    advance: Callable[[float], None],
+    folder: Path,
+    *,
+    areas: bool,
+) -> Iterator[RoadTable]:
     name = path.name.lower()
     if why := _ELSEWHERE.get(path.suffix.lower()):
         raise RoadSourceError(f"{path}: {why}")
@@ -271,25 +282,31 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
     import pyarrow.parquet as pq
 
     try:
-        _require_rows(path)
         with pq.ParquetFile(path) as file:
+            _require_rows(file.metadata.num_rows, path.stat().st_size)
             shape_column, crs, encoding = _geometry_of(file.schema_arrow)
             names = [name for name in file.schema_arrow.names if name != shape_column]
             leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
         wanted = [name for name in names if is_known_column(name)] or names
         text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
-        done, size = 0, 0
+        done = 0
         with pq.ParquetFile(path, read_dictionary=text) as file:
             for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
-                size += sum(map(_unpacked_size, batch.columns))
-                require_bounded(path, size)
                 columns = {name: objects(batch[name].to_pylist()) for name in wanted}
                 shapes, srid = _shapes(batch, shape_column, encoding)
                 yield RoadTable(shapes, crs or srid or None, columns, {"format": "Parquet"})
                 done += len(batch)
                 advance(done / file.metadata.num_rows)
+    except pa.ArrowMemoryError as error:
+        raise MemoryError(str(error)) from error
     except (ValueError, TypeError, LookupError, pa.ArrowException, OSError) as error:  # of its text, when looked at
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
+
+
+def _require_rows(rows: int, size: int) -> None:
+    """Raise `ValueError` where a file claims more rows than bytes: each would be looked at."""
+    if rows > size:
+        raise ValueError(f"its {size:,} bytes claim to hold {rows:,} rows")
 
 
 def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> tuple[str, Any, str]:
@@ -347,31 +364,6 @@ def _shapes(batch: Any, column: str, encoding: str) -> tuple[AnyArray, int]:
     return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy()), 0
 
 
-def _unpacked_size(column: Any) -> int:
-    """Return the bytes of a column's values; a value of a dictionary counts as often as it is named."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    if pa.types.is_dictionary(column.type):
-        return int(pc.sum(pc.take(pc.binary_length(column.dictionary), column.indices)).as_py() or 0)
-    if pa.types.is_struct(column.type):
-        return sum(map(_unpacked_size, column.flatten()))
-    return _unpacked_size(column.flatten()) if pa.types.is_nested(column.type) else int(column.nbytes)
-
-
-def _require_rows(path: Path) -> None:
-    """Refuse a file that claims more rows than bytes, or long lists: a few bytes may stand for billions of values."""
-    import pyarrow.parquet as pq
-
-    meta = pq.read_metadata(path)
-    groups = [meta.row_group(i) for i in range(meta.num_row_groups)]
-    values = max((group.column(j).num_values for group in groups for j in range(group.num_columns)), default=0)
-    unpacked = sum(group.total_byte_size for group in groups)
-    if meta.num_rows > (size := path.stat().st_size):
-        raise ValueError(f"its {size:,} bytes claim to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
-    require_bounded(path, max(unpacked, 8 * values))
-
-
 # --- graphs, and answers of Overpass ----------------------------------------------------------------------------------
 
 
@@ -381,7 +373,6 @@ def _read_graphml(path: Path) -> RoadTable:
 
     import networkx as nx
 
-    refuse_named_files(path)
     try:
         table = _graph_table(nx.read_graphml(path))
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:

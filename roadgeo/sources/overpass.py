@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import counted, visible
@@ -33,6 +33,7 @@ from roadgeo.sources.lines import RoadLines, objects, simple_areas
 from roadgeo.sources.schemas import recognise
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.folders import cache_dir, writable
+from roadgeo.storage.memory import bounded
 from roadgeo.storage.vectors import first_line, read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
@@ -43,6 +44,8 @@ _BUSY = (429, 504)  # osmnx waits a minute, and asks again without end
 _MOST_TRIES = 5
 _MOST_AGE_S = 30 * 86400.0
 _TAIL_BYTES = 4096  # of an answer, where Overpass puts its remark
+#: An answer of osmnx's largest area, of a dense city, has some 100 MB; servers give up before they take so long.
+_MOST_BYTES, _MOST_S, _CHUNK = 256 << 20, 600.0, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tup
     """
     with _asking(options.nominatim_url, options, say, place) as (osmnx, _):
         try:
-            found = osmnx.geocode_to_gdf(place)
+            with bounded(options.nominatim_url):
+                found = osmnx.geocode_to_gdf(place)
         except TypeError as error:
             raise RoadSourceError(
                 f"{place!r} is a point on OpenStreetMap, not an area; name a town or district, "
@@ -114,12 +118,14 @@ def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions
         osmnx.settings.cache_only_mode = True
         for side in _sides(area):
             try:
-                osmnx.graph_from_polygon(side, custom_filter=tags)
+                with bounded(options.overpass_url):
+                    osmnx.graph_from_polygon(side, custom_filter=tags)
             except InterruptedError:  # osmnx's own end of that mode, once all answers are kept
                 continue
         for file in sorted(folder.glob("*.json")):
-            answer = json.loads(file.read_bytes())
-            found |= {(str(item["type"]), str(item["id"])): item for item in answer["elements"]}
+            with bounded(file):
+                answer = json.loads(file.read_bytes())
+                found |= {(str(item["type"]), str(item["id"])): item for item in answer["elements"]}
             stamps += re.findall(r"timestamp_osm_base\W+([-\w:]+)", json.dumps(answer.get("osm3s")))
         if not found:
             shutil.rmtree(folder)
@@ -266,7 +272,8 @@ def _answers(url: str) -> bool:
     import requests
 
     try:
-        return bool(requests.get(url, timeout=30.0).ok)
+        with requests.get(url, timeout=30.0, stream=True, allow_redirects=False) as response:
+            return response.status_code == requests.codes.ok
     except requests.exceptions.RequestException:
         return False
 
@@ -283,8 +290,10 @@ class _Watch:
         Raises
         ------
         RoadSourceError
-            The server stays busy, or marks its answer as cut short.
+            The server stays busy, marks its answer as cut short, sends it without end, or sends us elsewhere.
         """
+        self._require_same(response)
+        self._receive(response)
         if response.url.endswith("/status"):
             wait = re.search(r"in (\d+) seconds", response.text)
             if wait and "slots available now" not in response.text:
@@ -303,6 +312,28 @@ class _Watch:
         else:
             self.n_answers += 1
             self.say(f"asking {self.host}, after {counted(self.n_answers, 'answer')}")
+
+    def _require_same(self, response: Any) -> None:
+        """Follow no redirect to another host, or to one that everybody on the way can read."""
+        if not response.is_redirect:
+            return
+        asked, target = (urlsplit(url) for url in (response.url, urljoin(response.url, response.headers["location"])))
+        if target.netloc != asked.netloc or (target.scheme != "https" and asked.scheme == "https"):
+            raise RoadSourceError(
+                f"{self.host} leads to {target.scheme}://{target.netloc}, which was not asked for; name that server"
+            )
+
+    def _receive(self, response: Any) -> None:
+        """Receive the body, within bounds of size and time: both are of what is unpacked, and of all of it."""
+        until, taken, parts = time.monotonic() + _MOST_S, 0, []
+        for part in response.iter_content(_CHUNK):
+            taken += len(part)
+            parts.append(part)
+            if taken > _MOST_BYTES or time.monotonic() > until:
+                response.close()
+                most = f"{_MOST_BYTES >> 20} MB" if taken > _MOST_BYTES else f"{_MOST_S:g} s"
+                raise RoadSourceError(f"{self.host} sends more than {most}; ask for a smaller area")
+        response._content = b"".join(parts)
 
 
 def _date_setting(date: str | None) -> str:

@@ -2,7 +2,8 @@
 
 Readers that hold the previous file open keep reading it; a writer killed at any moment leaves the previous file as it
 was, and at worst a staging folder that the next writer in the same place removes. The folder has a random name, is made
-anew and is the user's alone, and a link at the target is replaced: nobody leads a writer elsewhere.
+anew and is the user's alone, and a link at the target is replaced. Who may rename that folder, in a place that is
+shared, leads a writer elsewhere only where there is no fence (`storage.fence`).
 """
 
 from __future__ import annotations
@@ -26,14 +27,24 @@ except ImportError:  # Windows: there an open file cannot be deleted, which serv
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
-    "make_folder", "remove_leftovers", "remove_own", "replacing", "sync_file", "write_bytes", "write_text", "writing",
+    "make_folder", "remove_leftovers", "remove_own", "replacing", "stage", "sync_file", "write_bytes", "write_text",
+    "writing",
 ]  # fmt: skip
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
-_STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
+_NAME = r"\.roadgeo-[0-9a-f]{12}\.tmp"
+_STAGED = rf"{_NAME}[/\\\\]"
+#: Variable that tells processes that we start under which name staging folders lie together (see `stage`).
+_STAGE = "ROADGEO_STAGE"
 
-#: Staging folders of this process.
+#: Staging folders of this process, not of one that it was forked from.
 _own: set[Path] = set()
+#: Locks of those that stay until it ends, and folders that were made for them, which go where nothing was written.
+_held: list[BinaryIO] = []
+_made: list[Path] = []
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_own.clear)
+    os.register_at_fork(after_in_child=_made.clear)
 
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another disk",
@@ -104,7 +115,7 @@ def replacing(path: str | os.PathLike[str], sync: bool = True, *, may_exist: boo
                 if sync:
                     sync_file(staged)
                 if may_exist:
-                    staged.replace(target)
+                    _rename(staged, target)
                 else:
                     _rename_to_new(staged, target)
                 if sync:
@@ -124,6 +135,21 @@ def write_text(path: str | os.PathLike[str], content: str) -> None:
     write_bytes(path, content.encode())
 
 
+def _rename(staged: Path, target: Path) -> None:
+    """Rename a file; inside the fence of a Linux before 5.19, where none may leave its folder, a copy of it."""
+    try:
+        staged.replace(target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        copy = target.with_name(_random_name())
+        try:
+            shutil.copyfile(staged, copy)
+            copy.replace(target)
+        finally:
+            copy.unlink(missing_ok=True)
+
+
 def _rename_to_new(staged: Path, target: Path) -> None:
     """Rename a file to a name that must be free; a hard link tests that and takes it in one step."""
     try:
@@ -133,7 +159,7 @@ def _rename_to_new(staged: Path, target: Path) -> None:
     except OSError:  # no hard links on this disk: look first, and hope that nobody comes between
         if target.exists():
             raise
-        staged.replace(target)
+        _rename(staged, target)
 
 
 def sync_file(path: Path) -> None:
@@ -155,7 +181,8 @@ def _sync_folder(folder: Path) -> None:
 @contextlib.contextmanager
 def _locked_folder(parent: Path) -> Iterator[Path]:
     """Create a staging folder and lock it, so that other writers see that it is in use; remove it in the end."""
-    folder, lock = _make_folder(parent)
+    within = parent / os.environ.get(_STAGE, "-")
+    folder, lock = _make_folder(within if within.is_dir() else parent)
     try:
         yield folder
     finally:
@@ -164,16 +191,44 @@ def _locked_folder(parent: Path) -> Iterator[Path]:
         _own.discard(folder)
 
 
+def stage(parent: Path) -> Path:
+    """Make the folder within which this process, and those that it starts, make the files of a folder.
+
+    It is the same whenever it is asked for, and goes when the process ends.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made.
+    """
+    folder = parent / os.environ.setdefault(_STAGE, _random_name())
+    if not folder.is_dir():
+        if not parent.exists():
+            _made.append(parent.absolute())
+        make_folder(parent)
+        remove_leftovers(parent)
+        with writing(parent):
+            _held.append(_make_folder(parent, folder.name)[1])
+    return folder
+
+
 @atexit.register
 def remove_own() -> None:
     """Remove the staging folders of a process that ends: an interrupt may have come while one was made or removed."""
     while _own:
         shutil.rmtree(_own.pop(), ignore_errors=True)
+    while _made:
+        with contextlib.suppress(OSError):  # it is used
+            _made.pop().rmdir()
 
 
-def _make_folder(parent: Path) -> tuple[Path, BinaryIO]:
+def _random_name() -> str:
+    return f"{_PREFIX}{os.urandom(6).hex()}{_SUFFIX}"
+
+
+def _make_folder(parent: Path, name: str = "") -> tuple[Path, BinaryIO]:
     while True:
-        folder = parent / f"{_PREFIX}{os.urandom(6).hex()}{_SUFFIX}"
+        folder = parent / (name or _random_name())
         _own.add(folder)
         folder.mkdir(mode=0o700)
         try:
@@ -190,6 +245,8 @@ def _make_folder(parent: Path) -> tuple[Path, BinaryIO]:
 def remove_leftovers(parent: Path) -> None:
     """Remove staging folders of dead writers: their lock is free."""
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
+        if not re.fullmatch(_NAME, folder.name):
+            continue
         with contextlib.suppress(OSError):  # in use, or being removed by somebody else
             if not (folder / _LOCK).exists():
                 folder.rmdir()  # only ever empty: the lock is the first file and the last

@@ -1,17 +1,99 @@
-"""Memory given back to the system: blocks that libraries have freed, pages of mapped files."""
+"""Memory: how much of it readers of strangers' files may take, and what is given back to the system."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import mmap
-from collections.abc import Iterable
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray
+from roadgeo.errors import RoadSourceError
+from roadgeo.storage.fence import is_inside
 
-__all__ = ["give_back_memory", "let_pages_go"]
+__all__ = ["MEMORY", "bounded", "each_bounded", "give_back_memory", "let_pages_go"]
+
+_Part = TypeVar("_Part")
+
+#: Variable that tells how much memory the reading of a file may take, GB.
+MEMORY = "ROADGEO_MEMORY"
+#: Else it is so many bytes, and beyond them a multiple of the file's size, but no more than half of what is free.
+_FREE, _TIMES = 1 << 30, 100
+
+
+@contextlib.contextmanager
+def bounded(path: str | os.PathLike[str], before: int | None = None) -> Iterator[None]:
+    """Bound the memory that the block takes to read a file: inside the fence, or where ROADGEO_MEMORY says how much.
+
+    The bound is one of the whole process, and so not for programs that merely use roadgeo.
+
+    Parameters
+    ----------
+    before : int, optional
+        What the process held before the file was opened, bytes; by default what it holds now.
+
+    Raises
+    ------
+    RoadSourceError
+        It takes more.
+    """
+    held = _held_bytes() if before is None else before
+    if held is None or not (is_inside() or MEMORY in os.environ):
+        yield
+        return
+    import resource
+
+    most = _allowance(path)
+    kept, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limits = [limit for limit in (held + most, kept, hard) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
+    try:
+        yield
+    except MemoryError as error:
+        raise RoadSourceError(
+            f"{os.fspath(path)}: takes more than {most / 1e9:.1f} GB of memory to read; if you trust it, --memory GB"
+        ) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (kept, hard))
+
+
+def each_bounded(path: str | os.PathLike[str], parts: Iterable[_Part]) -> Iterator[_Part]:
+    """Yield the parts of a file, which are read within one bound on memory (see `bounded`), with all that is kept."""
+    before, rest = _held_bytes(), iter(parts)
+    while True:
+        with bounded(path, before):
+            part = next(rest, None)
+        if part is None:
+            return
+        yield part
+
+
+def _allowance(path: str | os.PathLike[str]) -> int:
+    """Return how much memory the reading of a file may take, bytes."""
+    with contextlib.suppress(ValueError):
+        return round(float(os.environ.get(MEMORY, "")) * 1e9)
+    size = Path(path).stat().st_size if Path(path).is_file() else 0
+    return min(_FREE + _TIMES * size, _available_bytes() // 2)
+
+
+def _held_bytes() -> int | None:
+    """Return the memory for data that this process has asked for; None where that is not known."""
+    try:
+        return int(Path("/proc/self/statm").read_text("ascii").split()[5]) * mmap.PAGESIZE
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _available_bytes() -> int:
+    """Return the memory that is free, or can be made so."""
+    found = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text("ascii"))
+    return int(found[1]) << 10 if found else _FREE
 
 
 def give_back_memory() -> None:

@@ -2,14 +2,13 @@
 
 The driver follows from the file's first bytes and is the only one that GDAL may use. Files beside the file, its
 overviews elsewhere, and the network are left alone (`storage.gdal`). A GDAL virtual raster names other files, and is
-opened only where the user allows it. Pictures that are to be turned are turned here (`storage.orientation`).
-Rasterio is imported only here and late: it takes longer than to read a mask.
+opened only inside the fence (`storage.fence`), or where the user allows it. Pictures that are to be turned are turned
+here (`storage.orientation`). Rasterio is imported only here and late: it takes longer than to read a mask.
 """
 
 from __future__ import annotations
 
 import contextlib
-import mmap
 import os
 import re
 import shutil
@@ -25,7 +24,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
-from roadgeo.storage.crs import file_in_bytes
+from roadgeo.storage.fence import is_inside, remedy
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
 from roadgeo.storage.orientation import (
     UPRIGHT,
@@ -82,7 +81,6 @@ _ARRAY = b"\x93NUMPY"
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
-_GEO_TEXT = 34737  # tag of GeoTIFF
 
 #: Endings of raw photographs, and tags of TIFF by which they are known: what of them GDAL reads is a thumbnail.
 RAW = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw")
@@ -136,9 +134,8 @@ def open_raster(
     if remote:
         drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
     else:
-        drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
+        drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * (is_ours or is_inside()))
     if not remote:
-        _require_own_crs(Path(path), drivers, name)
         if drivers == ["JP2OpenJPEG"]:
             _require_boxes(Path(path), name)
         if drivers == ["PNG"]:
@@ -166,7 +163,8 @@ def open_raster(
             raise MaskError(f"{name}: its metadata are not valid text; save it without them") from error
         except (RasterioError, CPLE_BaseError) as error:
             reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
-            raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error
+            remedied = remedy(reason) or "; give an image or GeoTIFF"
+            raise MaskError(f"{name}: not a raster that can be read ({reason}){remedied}") from error
 
 
 def raster_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -277,8 +275,6 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"{name}: a raw photograph ({path.suffix.lower()}), of which only a thumbnail could be read; develop it: "
             "save it as JPEG or TIFF"
         )
-    if driver != "VRT" and re.search(rb"<(VRTDataset|MRF_META|GDAL_WMS)", head):
-        raise MaskError(f"{name}: holds the text of a raster of another format; convert it to GeoTIFF if you trust it")
     if driver is None and not more:
         if Path(name).suffix.lower() in _IMAGES and head and not re.search(rb"[^\t\n\f\r -\x7e\x80-\xff]", head):
             raise MaskError(
@@ -321,36 +317,6 @@ def page_of(dataset: DatasetReader) -> str:
     if page:
         return f"page {page[1]}"
     return f"page 1 of {len(pages)}" if len(pages) > 1 else ""
-
-
-def _require_own_crs(path: Path, drivers: list[str], name: str) -> None:
-    """Refuse a raster whose CRS names a file, which GDAL would open with it, or whose pixels lie in another file.
-
-    A GeoTIFF has its CRS in a tag, JPEG 2000 and Erdas Imagine files have it anywhere, other formats have none.
-    """
-    found = ""
-    with path.open("rb") as file:
-        if drivers == ["GTiff"]:
-            with contextlib.suppress(struct.error):
-                for _, text, _ in tiff_values(file, 0, _GEO_TEXT):
-                    found = found or file_in_bytes(text)
-        elif drivers in (["HFA"], ["JP2OpenJPEG"]):
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                found = file_in_bytes(content) or (_file_of_imagine(content, path) if drivers == ["HFA"] else "")
-    if found:
-        raise MaskError(
-            f"{name}: names another file, {found[:60]!r}, which is not opened; convert it to a plain GeoTIFF"
-        )
-
-
-def _file_of_imagine(content: mmap.mmap, path: Path) -> str:
-    """Return the other file where an Erdas Imagine file keeps its pixels, or its overviews if they are there."""
-    if re.search(rb"(?<!_)ExternalRasterDMS\0", content):
-        return f"{path.stem}.ige"
-    if not re.search(rb"(?<!_)RRDNamesList\0", content):
-        return ""
-    named = {os.fsdecode(name) for name in re.findall(rb"([^\0(]{1,255})\(:", content)} - {path.name}
-    return next((name for name in sorted(named) if os.path.exists(path.parent / name)), "")  # noqa: PTH110
 
 
 def _require_boxes(path: Path, name: str) -> None:
@@ -500,9 +466,7 @@ def _turned(dataset: DatasetReader, orientation: int, name: str) -> Iterator[Dat
 
 
 def _require_plain(dataset: DatasetReader, name: str) -> None:
-    """Refuse rasters whose own metadata send GDAL to other files, or that cannot be decoded in parts."""
-    import numpy as np
-
+    """Refuse rasters whose metadata have other files opened by any driver, or that cannot be decoded in parts."""
     if dataset.tags(ns="OVERVIEWS"):
         raise MaskError(f"{name}: names a file elsewhere as its overviews; remove that (gdal_edit.py -unsetmd)")
     block = max(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import RoadSourceError
-from roadgeo.storage.crs_guard import refuse_named_files
+from roadgeo.storage.fence import remedy
 from roadgeo.storage.gdal import CONSENT, NETWORK, OWN_SHIFT, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
@@ -126,7 +126,6 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
     from pyogrio.errors import CRSError, DataLayerError, DataSourceError
 
     require_file(path)
-    refuse_named_files(path)
     _require_stored(path, layer)
     file = path
     try:
@@ -140,7 +139,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
         reason = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
         reason = reason.replace(str(file), str(path))
         hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if reason.startswith("of") else ""
-        raise RoadSourceError(f"{path}: not readable as a map of roads: {reason}{hint}") from error
+        raise RoadSourceError(f"{path}: not readable as a map of roads: {reason}{hint}{remedy(reason)}") from error
 
 
 @contextmanager

@@ -94,21 +94,6 @@ def test_a_series_says_that_it_tells_no_kinds(caplog):
     assert roads.meta["sources"][0]["kinds_known"] is False
 
 
-@pytest.mark.parametrize("nested", [False, True])
-@pytest.mark.parametrize("which", ["highway", "geometry"])
-def test_a_value_that_is_stored_once_counts_as_often_as_it_is_read(which, nested, tmp_path):
-    """A file of 2 kB took 8 GB."""
-    long = {"highway": b"x" * 1_000_000, "geometry": shapely.LineString(np.zeros((60_000, 2))).wkb}[which]
-    short = {"highway": b"primary", "geometry": shapely.LineString([(0, 0), (1, 1)]).wkb}
-    columns = {name: pa.array([value] * 100, pa.binary()) for name, value in {**short, which: long}.items()}
-    if nested:
-        columns["highway"] = pa.array([[value.as_py()] for value in columns["highway"]], pa.list_(pa.binary()))
-    pq.write_table(pa.table(columns), tmp_path / "roads.parquet", compression="zstd")
-    assert (tmp_path / "roads.parquet").stat().st_size < 5000
-    with pytest.raises(RoadSourceError, match="unpacks to more than 100 times its size"):
-        choose_roads(tmp_path / "roads.parquet")
-
-
 def merged(name: str = "geometry") -> pd.DataFrame:
     """Return what `pd.merge` of a table and a GeoDataFrame gives: it has shapes, and no CRS."""
     roads = gpd.GeoDataFrame({"highway": streets()[1], name: streets()[0]}, geometry=name, crs=CRS)

@@ -86,6 +86,19 @@ def test_a_cache_that_cannot_be_written_is_done_without(osm, pauses, tmp_path, m
     assert len(fetch_roads("Fenway, Boston", options=ask(osm))) > 0
 
 
+def test_another_server_is_not_asked(osm, pauses):
+    osm.overpass.append((307, {"Location": "http://localhost:9/api/interpreter"}, b""))
+    with pytest.raises(RoadSourceError, match="leads to http://localhost:9, which was not asked for"):
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))
+
+
+@pytest.mark.parametrize(("limit", "value", "said"), [("_MOST_BYTES", 100, "more than 0 MB"), ("_MOST_S", 0.0, "0 s")])
+def test_answers_without_end_are_cut_off(osm, pauses, monkeypatch, limit, value, said):
+    monkeypatch.setattr(f"roadgeo.sources.overpass.{limit}", value)
+    with pytest.raises(RoadSourceError, match=said):
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))
+
+
 def test_roads_as_of_a_day(osm, pauses):
     roads = fetch_roads(bbox=OUTLINE.bounds, options=ask(osm, date="2019-10-28"))
     assert '[date:"2019-10-28T00:00:00Z"]' in osm.queries[0]

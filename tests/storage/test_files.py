@@ -99,7 +99,7 @@ def test_a_living_writer_is_left_alone_and_a_dead_one_cleared_away(tmp_path: Pat
         assert (folder / "half").exists()
         process.send_signal(signal.SIGKILL)
     assert folder.exists()
-    (tmp_path / ".roadgeo-abc.tmp").mkdir()  # killed between making the folder and its lock
+    (tmp_path / ".roadgeo-0123456789ab.tmp").mkdir()  # killed between making the folder and its lock
     files._remove_leftovers_once.cache_clear()
     write_text(tmp_path / "a.txt", "")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
@@ -107,7 +107,7 @@ def test_a_living_writer_is_left_alone_and_a_dead_one_cleared_away(tmp_path: Pat
 
 def test_folders_of_one_relative_name_are_each_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for place in ("first", "second"):
-        (tmp_path / place / "out" / ".roadgeo-abc.tmp").mkdir(parents=True)
+        (tmp_path / place / "out" / ".roadgeo-0123456789ab.tmp").mkdir(parents=True)
         monkeypatch.chdir(tmp_path / place)
         write_text(Path("out/a.txt"), "")
         assert [path.name for path in Path("out").iterdir()] == ["a.txt"]

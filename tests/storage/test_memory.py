@@ -1,15 +1,19 @@
-"""Memory of many small objects, and of mapped files, goes back to the system."""
+"""Memory: readers of strangers' files take a bounded amount; that of small objects, and of mapped files, goes back."""
 
+import json
 import mmap
 import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
-from roadgeo.storage.memory import let_pages_go
+from roadgeo.storage.fence import abi_version
+from roadgeo.storage.memory import _allowance, let_pages_go
 
 CODE = """
 import numpy, shapely
@@ -65,3 +69,66 @@ def test_what_lies_beside_it_in_the_file_stays(tmp_path) -> None:
     let_pages_go([second, second[:0], second[5:6]])
     assert 25.0 < before - resident_mb() < 35.0
     assert first.sum() + second.sum() == total
+
+
+# --- bombs ------------------------------------------------------------------------------------------------------------
+
+READ = """
+import re, sys
+from pathlib import Path
+import roadgeo
+from roadgeo.errors import RoadSourceError
+from roadgeo.sources.roads import read_roads
+assert roadgeo.fence(sys.argv[1])
+try:
+    read_roads(sys.argv[1], which="all")
+except RoadSourceError as error:
+    print(error)
+print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024)
+"""
+
+
+def bomb(path: Path, which: str) -> None:
+    """Write a Parquet file of some kB: with millions of rows of nothing, or the same MB again and again."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    rows, groups = (1_000_000, 5) if which == "null" else (100, 40)
+    line = pa.array([shapely.to_wkb(shapely.LineString([(0, 0), (1, 1)]))] * rows, pa.binary())
+    long = pa.array([b"x" * 1_000_000], {"fixed": pa.binary(1_000_000)}.get(which, pa.binary()))
+    columns = {
+        "geometry": pa.nulls(rows, pa.binary()) if which == "null" else line,
+        "name": pa.nulls(rows, pa.string()) if which == "null" else long.take(pa.array(np.zeros(rows, np.int32))),
+    }
+    geo = {"version": "1.0.0", "primary_column": "geometry", "columns": {"geometry": {"encoding": "WKB"}}}
+    table = pa.table(columns).replace_schema_metadata({b"geo": json.dumps(geo).encode()})
+    with pq.ParquetWriter(path, table.schema, compression="zstd") as file:
+        for _ in range(groups):
+            file.write_table(table)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not abi_version(), reason="only inside a fence, which this system has not")
+@pytest.mark.parametrize(
+    ("which", "message"),
+    [
+        ("null", "bytes claim to hold 5,000,000 rows"),
+        *((which, r"takes more than 1\.\d GB of memory to read") for which in ("fixed", "text")),
+    ],
+)
+def test_few_bytes_that_stand_for_many_end_in_a_line(which: str, message: str, tmp_path: Path) -> None:
+    bomb(tmp_path / "roads.parquet", which)
+    assert (tmp_path / "roads.parquet").stat().st_size < 1_000_000
+    command = [sys.executable, "-c", READ, str(tmp_path / "roads.parquet")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    said, megabytes = done.stdout.strip().splitlines()
+    assert re.search(message, said)
+    assert int(megabytes) < 1500
+
+
+def test_the_bound_goes_with_the_file_and_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "small").write_bytes(bytes(1_000_000))
+    monkeypatch.setattr("roadgeo.storage.memory._available_bytes", lambda: 1 << 40)
+    assert _allowance(tmp_path / "small") == (1 << 30) + 100_000_000
+    monkeypatch.setattr("roadgeo.storage.memory._available_bytes", lambda: 1 << 30)
+    assert _allowance(tmp_path / "small") == 1 << 29
+    monkeypatch.setenv("ROADGEO_MEMORY", "2.5")
+    assert _allowance(tmp_path / "small") == 2_500_000_000

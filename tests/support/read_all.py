@@ -1,4 +1,4 @@
-"""Read each file of the corpus with its reader, in a folder: what is opened meanwhile is for a tracer to see.
+"""Read each file of the corpus with its reader, in a folder and inside a fence; what is opened is for a tracer to see.
 
 python tests/support/read_all.py FOLDER
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import roadgeo
 from support.readers import READERS, drivers_registered_once, feed, seeds
 
 #: They listen to, or call, a server that they start.
@@ -21,6 +22,7 @@ BEGIN = "/roadgeo-reads-strangers-files"
 def main() -> None:
     """Read all files twice: what libraries open when they are used for the first time is left out."""
     folder = Path(sys.argv[1])
+    roadgeo.fence(read=Path(__file__).parents[2], write=folder)
     with drivers_registered_once():
         for turn in range(2):
             if turn:

@@ -50,6 +50,7 @@ from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
 from roadgeo.sources.streams import stream_lines
 from roadgeo.storage import vectors
 from roadgeo.storage.crs import crs_name
+from roadgeo.storage.memory import MEMORY
 from support.untrusted_web import answered, serve_request
 
 CORPUS = Path(__file__).parents[1] / "corpus"
@@ -359,13 +360,18 @@ def feed(reader: Reader, folder: Path) -> Callable[[bytes], None]:
 
 @contextmanager
 def drivers_registered_once() -> Iterator[None]:
-    """Leave GDAL's few drivers registered between files: registering them takes longer than most files do."""
+    """Leave GDAL's few drivers registered between files: registering them takes longer than most files do.
+
+    And bound the memory that each file takes, as inside a fence.
+    """
+    os.environ[MEMORY] = "1"
     with vectors._few_drivers():
         vectors._few_drivers, kept = contextlib.nullcontext, vectors._few_drivers
         try:
             yield
         finally:
             vectors._few_drivers = kept
+            del os.environ[MEMORY]
 
 
 def seeds(name: str) -> list[Path]:

@@ -31,6 +31,8 @@ _MAX_SECONDS = 600.0  # of one tile
 
 _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
+#: Operators on text, of which a few numbers make any amount.
+_TEXT = {"StringConcat", "StringNormalizer", "StringSplit", "RegexFullMatch", "TfIdfVectorizer"}
 _ORT = b"ORTM"  # where the file of another format has it, which onnxruntime would read instead
 _STRING = 8  # of TensorProto.DataType
 
@@ -54,7 +56,14 @@ _SCHEMA = (
     (
         "Attribute",
         (
-            *(("tensor", 5, "Tensor"), ("tensors", 10, "Tensor"), ("graph", 6, "bytes"), ("graphs", 11, "bytes")),
+            *(
+                ("name", 1, "bytes"),
+                ("number", 3, "int64"),
+                ("tensor", 5, "Tensor"),
+                ("tensors", 10, "Tensor"),
+                ("graph", 6, "bytes"),
+                ("graphs", 11, "bytes"),
+            ),
             *(("sparse", 22, "bytes"), ("sparses", 23, "bytes")),
         ),
     ),
@@ -201,6 +210,9 @@ def _require_plain(node: Any) -> None:
     if operator in _CONTROL | _RANDOM or len(node.operator) > 1:
         what = "random numbers" if operator in _RANDOM else "control flow"
         raise ModelError(f"uses {what} ({operator}); expected a plain network: export it anew")
+    to_text = any(attribute.name == [b"to"] and _STRING in attribute.number for attribute in node.attribute)
+    if operator in _TEXT or (operator == "Cast" and to_text):
+        raise ModelError(f"computes with text ({operator}); expected a network for pictures")
     for attribute in node.attribute:
         if attribute.graph or attribute.graphs or attribute.sparse or attribute.sparses:
             raise ModelError("holds graphs or sparse tensors within operators; expected a plain network")

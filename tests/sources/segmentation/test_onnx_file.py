@@ -76,6 +76,14 @@ HOSTILE = {
         "cannot be loaded",
     ),
     "constant that lies": (constant_attribute, "cannot be loaded"),
+    "text": (
+        lambda: (
+            [node("Cast", ["image"], ["t"], to=TensorProto.STRING), node("StringConcat", ["t", "t"], ["road"])],
+            [],
+        ),
+        "computes with text",
+    ),
+    "patterns": (lambda: ([node("RegexFullMatch", ["image"], ["road"], pattern="(a*)*b")], []), "computes with text"),
     "strings": (lambda: ([], [tensor("w", TensorProto.STRING, [1], string_data=[b"x"])]), "a tensor of text"),
 }
 

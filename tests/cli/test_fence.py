@@ -1,0 +1,134 @@
+"""Files of strangers that name others: nothing that they name is opened, whichever way it is written."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import rasterio
+from worlds.demo import DRONE
+from worlds.hostile import MAPS, MASKS, naming, virtual
+
+from roadgeo.storage.fence import abi_version
+from roadgeo.storage.folders import cache_dir
+from roadgeo.storage.rasters import raster_size
+
+pytestmark = pytest.mark.skipif(not abi_version(), reason="this system has no Landlock (Linux 5.13 and later)")
+
+#: Reads all that lies in a folder, inside a fence around that folder, and prints what it made of each.
+READ = """
+import sys
+from pathlib import Path
+import roadgeo
+from roadgeo.errors import RoadgeoError
+from roadgeo.sources.georeference import read_georeference
+from roadgeo.sources.masks import read_mask
+from roadgeo.sources.roads import read_roads
+from roadgeo.storage.rasters import name_page
+assert roadgeo.fence(sys.argv[1])
+for path in sorted(Path(sys.argv[1]).glob("*/*.*")):
+    reads = {"mask": (read_mask, read_georeference, lambda path: read_georeference(name_page(str(path), 2)))}
+    for read in reads.get(path.stem, [lambda path: read_roads(path, which="all")]):
+        try:
+            read(path)
+            said = "read"
+        except RoadgeoError as error:
+            said = str(error)
+            assert "\\n" not in said
+        print(path, said)
+"""
+
+
+@pytest.fixture(scope="module")
+def strace() -> list[str]:
+    command = ["strace", "-f", "-qq", "--seccomp-bpf", "-s", "4096", "-e", "trace=open,openat"]
+    traced = shutil.which("strace") and subprocess.run([*command, "true"], capture_output=True, check=False)
+    if not traced or traced.returncode:
+        pytest.skip("strace is missing, or must not trace")
+    return command
+
+
+def surroundings(folder: Path) -> dict[str, str]:
+    return {**os.environ, "ROADGEO_CACHE": str(cache_dir()), "ROADGEO_LIBRARY": str(folder / "library")}
+
+
+def test_no_map_and_no_mask_has_another_file_opened(tmp_path: Path, strace: list[str]) -> None:
+    """By the system's own account; where the fence is down, most of them have it opened, and pipes never end."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "grid.gsb").write_bytes(bytes(4096))
+    os.mkfifo(tmp_path / "elsewhere" / "fifo.ige")
+    for target in ("grid.gsb", "fifo.ige"):
+        file = str(tmp_path / "elsewhere" / target)
+        makers = [(make, crs) for make in MAPS for crs in naming(file)[::3]] + [(make, file) for make in MASKS]
+        for n, (make, named) in enumerate(makers):
+            folder = tmp_path / "given" / f"{target}-{n}-{make.__name__}"
+            folder.mkdir(parents=True)
+            make(folder, named)
+    command = [*strace, "-o", str(tmp_path / "trace"), sys.executable, "-c", READ, str(tmp_path / "given")]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=surroundings(tmp_path), capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    tried = [line for line in (tmp_path / "trace").read_text().splitlines() if re.search(r'elsewhere/[a-z.]+"', line)]
+    assert not [line for line in tried if " = -1 " not in line]
+    assert {kind for line in tried if "EACCES" in line for kind in ("grid.gsb", "fifo.ige") if kind in line} == {
+        "grid.gsb",
+        "fifo.ige",
+    }
+    assert len(tried) > 100
+
+
+def roadgeo(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "roadgeo", *words]
+    return subprocess.run(
+        command, cwd=folder, env=surroundings(folder), capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_neither_is_what_lies_beside_it_where_results_go(tmp_path: Path, strace: list[str]) -> None:
+    (tmp_path / "beside.gsb").write_bytes(bytes(4096))
+    MAPS[0](tmp_path, naming(str(tmp_path / "beside.gsb"))[0])
+    command = ["-m", "roadgeo", "index", "--roads", "roads.geojson", "--out", "made.gpkg"]
+    traced = [*strace, "-o", "trace", sys.executable, *command]
+    subprocess.run(traced, cwd=tmp_path, env=surroundings(tmp_path), capture_output=True, timeout=300, check=False)
+    tried = [line for line in (tmp_path / "trace").read_text().splitlines() if 'beside.gsb"' in line]
+    assert tried
+    assert not [line for line in tried if " = -1 " not in line]
+
+
+def test_a_virtual_raster_reads_what_it_names_where_that_is_allowed(porto: Path, tmp_path: Path) -> None:
+    (tmp_path / "tiles").mkdir()
+    shutil.copy(DRONE, tmp_path / "tiles" / "drone.png")
+    size = raster_size(DRONE)
+    text = virtual(tmp_path, "tiles/drone.png").read_text()
+    text = text.replace('YSize="64"', f'YSize="{size[1]}"').replace('XSize="64"', f'XSize="{size[0]}"')
+    (tmp_path / "mask.vrt").write_text(text.replace('relativeToVRT="0"', 'relativeToVRT="1"'))
+    refused = roadgeo(tmp_path, "locate", "mask.vrt", "-r", str(porto))
+    assert refused.returncode == 1
+    assert refused.stderr.count("\n") == 1
+    assert "--allow" in refused.stderr
+    assert roadgeo(tmp_path, "locate", "mask.vrt", "-r", str(porto), "--allow", "tiles").returncode == 0
+
+
+def test_a_reference_in_another_folder_gets_its_index_there(porto: Path, tmp_path: Path) -> None:
+    (tmp_path / "maps").mkdir()
+    shutil.copy(porto, tmp_path / "maps")
+    shutil.copy(DRONE, tmp_path)
+    for name in ("maps/porto.gpkg", "maps/porto"):
+        done = roadgeo(tmp_path, "locate", "drone.png", "-r", name, "-o", "found", "-j", "2", "-q")
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / "maps" / "porto.index").is_file()
+    assert not list(tmp_path.rglob(".roadgeo*"))
+
+
+def test_images_are_corrected_where_they_lie(porto: Path, tmp_path: Path) -> None:
+    shutil.copy(DRONE, tmp_path)
+    assert roadgeo(tmp_path, "locate", "drone.png", "-r", str(porto)).returncode == 0
+    with rasterio.open(tmp_path / "drone_footprint.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as raster:
+        raster.transform = rasterio.Affine.translation(30.0, 20.0) @ raster.transform
+    done = roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "--in-place", "-o", "said")
+    assert done.returncode == 4, done.stderr
+    assert roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "-o", "said").returncode == 0
