@@ -26,7 +26,8 @@ from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
 
 #: A fix is wrong where a frame's middle lies further than this from the truth, metres.

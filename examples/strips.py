@@ -17,7 +17,7 @@ from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.strips import place_strips
 from roadgeo.flights.tracker import FlightFrame
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.sources.masks import read_mask
 
 

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from roadgeo.location import Location
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.schemas import read_schema
-    from roadgeo.reference.reference import BuildOptions, Reference, open_reference
+    from roadgeo.reference.opening import open_reference
+    from roadgeo.reference.reference import BuildOptions, Reference
     from roadgeo.reference.shards import ShardedReference
     from roadgeo.workflows import explain
 
@@ -62,7 +63,7 @@ _HOMES = {
     "fence": "api",
     "index": "api",
     "locate": "api",
-    "open_reference": "reference.reference",
+    "open_reference": "reference.opening",
     "read_schema": "outputs.schemas",
     "track": "api",
     "vectorize": "api",

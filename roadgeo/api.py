@@ -15,7 +15,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.hints import apply_hints, read_hint
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, digest_of, swapped_near
+from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
+from roadgeo.reference.reference import BuildOptions, Reference
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.running.answers import Answer

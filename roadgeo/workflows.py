@@ -19,7 +19,8 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
 from roadgeo.matching.veto import contest
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, open_whole
+from roadgeo.reference.opening import AnyReference
+from roadgeo.reference.reference import BuildOptions, Reference, open_whole
 from roadgeo.roads.network import build_network
 
 if TYPE_CHECKING:

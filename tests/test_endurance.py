@@ -14,7 +14,8 @@ from support.endurance import draw_masks
 from worlds.scenes import random_network
 
 from roadgeo.matching.index import build_index
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
 _SCRIPT = Path(__file__).parent / "support" / "endurance.py"

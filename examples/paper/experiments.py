@@ -26,7 +26,8 @@ from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections, find_intersections
 from roadgeo.roads.network import RoadNetwork, as_stored

@@ -21,7 +21,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.pose import Pose, find_pose
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.roads.observed import find_voids
 from roadgeo.workflows import locate
 

@@ -47,7 +47,7 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.evaluation.trials import Mask, ReferenceLocator, Trial, run_trials  # noqa: E402
 from roadgeo.evaluation.truth import Truth  # noqa: E402
 from roadgeo.location import ERROR_RATES  # noqa: E402
-from roadgeo.reference.reference import open_reference  # noqa: E402
+from roadgeo.reference.opening import open_reference  # noqa: E402
 from roadgeo.sources.roads import Roads, read_roads  # noqa: E402
 from roadgeo.workflows import LocateOptions, build_reference  # noqa: E402
 

@@ -23,7 +23,7 @@ from roadgeo.evaluation.trials import read_landscape
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching.shifts import Shift, move_about
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.running.verifying import verify_image
 
 KINDS = ("clean", "segmented", "poor")

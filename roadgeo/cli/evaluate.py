@@ -207,7 +207,7 @@ def _evaluate(
 def _maps_of(locator: ReferenceLocator, truths: Sequence[Truth]) -> list[ReferenceIndex]:
     """Return the maps, or of a divided one the parts, that the masks lie on."""
     from roadgeo.geometry.projection import to_lonlat
-    from roadgeo.reference.reference import open_reference
+    from roadgeo.reference.opening import open_reference
 
     placed = [truth for truth in truths if truth.on_map and truth.crs is not None]
     there = [to_lonlat(str(truth.crs), truth.center).tolist() for truth in placed]

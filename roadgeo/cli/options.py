@@ -20,7 +20,7 @@ from roadgeo.storage.memory import MEMORY
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
-    from roadgeo.reference.reference import AnyReference
+    from roadgeo.reference.opening import AnyReference
     from roadgeo.running.cluster import Cluster
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.tasks import Task
@@ -483,7 +483,7 @@ def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = No
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
-    from roadgeo.reference.reference import swapped_near
+    from roadgeo.reference.opening import swapped_near
     from roadgeo.running.batch import open_references
 
     references = open_references(names, print_steps())

@@ -29,7 +29,7 @@ from roadgeo.cli.printing import complain, echo, is_set, paint, plain, tell
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
-    from roadgeo.reference.reference import AnyReference
+    from roadgeo.reference.opening import AnyReference
     from roadgeo.running.verifying import Verified, VerifyRun
 
 __all__ = ["describe", "verify_command"]

@@ -18,7 +18,7 @@ from roadgeo.evaluation.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.projection import to_plane
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.running.processes import run
 from roadgeo.storage.files import write_text, writing
 from roadgeo.workflows import LocateOptions, locate

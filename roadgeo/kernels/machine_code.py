@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import llvmlite.ir as ir
 import numba
@@ -19,7 +19,6 @@ from numba.core.registry import cpu_target
 from numba.np.arrayobj import populate_array
 
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind
-from roadgeo.kernels.compilation import Kernel
 
 __all__ = ["CannotKeep", "compile_kernels"]
 
@@ -31,6 +30,18 @@ _DATA, _SHAPE = 16, 32
 _C = {"malloc", "free", "memset", "memcpy", "memmove"}
 _MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "log", "log10", "pow", "fmod", "sqrt", "hypot")
 _IN_EVERY_PROCESS = _C | {*_MATH, *(f"{name}f" for name in _MATH)}
+
+
+class Kernel(Protocol):
+    """What is compiled (see `compilation.Kernel`)."""
+
+    name: str
+    arguments: tuple[Kind, ...] | None
+    result: Kind
+
+    @property
+    def part(self) -> Any:
+        """Functions that numba compiles."""
 
 
 class CannotKeep(Exception):  # noqa: N818

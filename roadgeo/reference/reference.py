@@ -1,11 +1,11 @@
-"""References: how they are built, opened and built again."""
+"""A reference in one piece: how it is built, opened and built again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
@@ -22,19 +22,13 @@ from roadgeo.storage.memory import let_pages_go
 if TYPE_CHECKING:
     import networkx as nx
 
-    from roadgeo.reference.shards import ShardedReference
-
 __all__ = [
     "COARSE",
-    "AnyReference",
     "BuildOptions",
     "Reference",
-    "digest_of",
-    "open_reference",
     "open_whole",
     "rebuild_reference",
     "stored_options",
-    "swapped_near",
 ]
 
 
@@ -109,30 +103,6 @@ class Reference:
         write_reference(path, self.network, (self.index.meta, self.index.arrays()), say)
 
 
-#: One piece, or shards.
-AnyReference: TypeAlias = "Reference | ShardedReference"
-
-
-def digest_of(references: Sequence[AnyReference], name: str) -> str:
-    """Return the digest of the reference of that name; of all where none has it, for they were searched in vain."""
-    here = [reference for reference in references if reference.name == name][:1] or references
-    return ", ".join(reference.digest for reference in here if reference.digest)
-
-
-def swapped_near(
-    near: tuple[float, float, float], references: Sequence[AnyReference]
-) -> tuple[float, float, float] | None:
-    """Return a circle (longitude, latitude, metres) the other way round, where only then it touches one of the maps."""
-    lon, lat, radius = near
-    if abs(lon) > 90.0 or _touches(near, references):
-        return None
-    return (lat, lon, radius) if _touches((lat, lon, radius), references) else None
-
-
-def _touches(near: tuple[float, float, float], references: Sequence[AnyReference]) -> bool:
-    return any(part.may_hold(near) for one in references for part in one.parts)
-
-
 def stored_options(network: RoadNetwork) -> BuildOptions:
     """Return the options that a network was built with; the defaults for those that are not stored.
 
@@ -169,30 +139,8 @@ def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
     return kind(**values)
 
 
-def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
-    """Open a reference: REF.gpkg with its REF.index, REF.shards, also at a URL, or one of the library by its name.
-
-    A missing index, or one of an earlier format, is built from the GeoPackage. For shards only the manifest is read;
-    each is opened when it is first searched.
-
-    >>> roadgeo.open_reference("porto.gpkg").name
-    'porto'
-
-    Raises
-    ------
-    IndexFormatError
-        If there is no such reference, or it is damaged, hostile, stale or of another version.
-    """
-    from roadgeo.reference.library import resolve_reference
-    from roadgeo.reference.shards import manifest_path, open_shards
-
-    found = resolve_reference(path)
-    manifest = manifest_path(found) if found.is_dir() else None
-    return open_whole(found, say) if manifest is None else open_shards(manifest)
-
-
 def open_whole(path: str | Path, say: Say = say_nothing) -> Reference:
-    """Open a reference of one piece (see `open_reference`)."""
+    """Open a reference of one piece (see `opening.open_reference`)."""
     from roadgeo.reference.files import open_reference as open_parts
     from roadgeo.reference.files import reference_digest, reference_paths
 

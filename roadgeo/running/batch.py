@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.reference.reference import AnyReference
+    from roadgeo.reference.opening import AnyReference
     from roadgeo.running.cluster import Cluster
     from roadgeo.running.looks import Locate, Sighting
     from roadgeo.workflows import LocateOptions
@@ -57,7 +57,7 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[AnyRef
     IndexFormatError
         A reference is missing or unusable, or the library is empty.
     """
-    from roadgeo.reference.reference import open_reference
+    from roadgeo.reference.opening import open_reference
 
     return [open_reference(path, say) for path in _resolve(names)]
 
@@ -273,7 +273,7 @@ class Locating:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
-        from roadgeo.reference.reference import digest_of
+        from roadgeo.reference.opening import digest_of
         from roadgeo.running.choosing import take_place
         from roadgeo.running.queries import locate_query
         from roadgeo.sources.georeference import read_stated_middle

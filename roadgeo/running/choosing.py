@@ -17,7 +17,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.matching.verdict import match_again
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.probability_files import is_ours

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.matching.options import LocateOptions
     from roadgeo.matching.parts import Part
-    from roadgeo.reference.reference import AnyReference
+    from roadgeo.reference.opening import AnyReference
 
 __all__ = ["owners", "run_divided"]
 

@@ -20,7 +20,7 @@ from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 __all__ = ["Locate", "Seen", "Sighting", "locate_looks", "total_seconds"]

@@ -24,7 +24,7 @@ from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.verdict import searched_within
 from roadgeo.plugins import SEGMENTERS, call_plugin
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.roads.thresholds import spread_probability
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions, is_model

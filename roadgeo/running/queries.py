@@ -19,7 +19,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference, swapped_near
+from roadgeo.reference.opening import AnyReference, swapped_near
 from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, open_frame, plugin_of

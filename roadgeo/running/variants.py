@@ -21,7 +21,7 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.running.looks import Locate
 
 __all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "undoing"]

@@ -31,7 +31,7 @@ from roadgeo.running.tasks import Task
 from roadgeo.sources.georeference import read_georeference
 
 if TYPE_CHECKING:
-    from roadgeo.reference.reference import AnyReference
+    from roadgeo.reference.opening import AnyReference
 
 __all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image"]
 

@@ -22,7 +22,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route
 
 from roadgeo._version import __version__
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, problem
 from roadgeo.serving.jobs import Job, Jobs
 from roadgeo.serving.options import ServeOptions

@@ -16,7 +16,7 @@ from roadgeo.geometry.areas import Box
 from roadgeo.geometry.projection import from_lonlat, to_lonlat, transform
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import join_segments
-from roadgeo.reference.reference import AnyReference
+from roadgeo.reference.opening import AnyReference
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.storage.vectors import read_layer
 

@@ -17,7 +17,7 @@ from worlds.fenway import write_streets, write_vector
 from worlds.scenes import random_lines
 
 from roadgeo.cli import main
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from pyproj import CRS
 
 import roadgeo
 from roadgeo.evaluation.demo import ROADS
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 
 SCALE = Path(__file__).parents[2] / "examples" / "scale"
 

@@ -23,7 +23,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Location, Reason
 from roadgeo.outputs.report import Entry, render_batch
 from roadgeo.outputs.report.verification import write_verification
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 

@@ -30,7 +30,8 @@ from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.report import Entry, render_batch, write_batch
 from roadgeo.outputs.report.page import render_report as render_subject
 from roadgeo.outputs.subject import Subject, ViewOptions
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 

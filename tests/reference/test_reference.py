@@ -11,7 +11,8 @@ import roadgeo
 from roadgeo.errors import IndexFormatError
 from roadgeo.matching.index import IndexOptions
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import BuildOptions, open_reference, stored_options
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import BuildOptions, stored_options
 from roadgeo.roads.intersections import IntersectionOptions
 from roadgeo.roads.simplification import SimplifyOptions
 

@@ -15,7 +15,8 @@ from roadgeo.matching.index import build_index
 from roadgeo.reference import remote
 from roadgeo.reference.files import reference_digest
 from roadgeo.reference.library import resolve_reference
-from roadgeo.reference.reference import Reference, open_reference, open_whole
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference, open_whole
 from roadgeo.reference.shards import Manifest, ShardEntry, write_manifest
 from roadgeo.roads.network import as_stored
 

@@ -23,7 +23,7 @@ from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.inspection import check_reference
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.reference.shards import write_manifest
 from roadgeo.roads.network import build_network
 from roadgeo.running import sharding

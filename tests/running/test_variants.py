@@ -7,7 +7,7 @@ import pytest
 from worlds.demo import DRONE
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 from roadgeo.running.variants import Variant, in_pixels_of, mirrored, resampled
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate

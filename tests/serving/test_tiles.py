@@ -9,7 +9,8 @@ import pytest
 from mapbox_vector_tile import decode
 
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 
 WORLD_M = 2 * 20037508.342789244

@@ -30,7 +30,8 @@ from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Content, Location
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Sighting
 from roadgeo.running.pool import Died
 from roadgeo.serving.workers import Asked, Serving, Workers, _answer

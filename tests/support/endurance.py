@@ -29,7 +29,8 @@ from worlds.scenes import random_lines, random_network
 from roadgeo.errors import MaskError
 from roadgeo.matching.index import build_index
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.opening import open_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
 SIDE = 300

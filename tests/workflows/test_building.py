@@ -10,7 +10,7 @@ from worlds.fenway import streets
 import roadgeo
 from roadgeo.cli import main
 from roadgeo.errors import CrsError, RoadSourceError
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.opening import open_reference
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,56 @@
+"""References of any kind: opened by their path or name, and what is asked of several together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+from roadgeo._progress import Say, say_nothing
+from roadgeo.reference.library import resolve_reference
+from roadgeo.reference.reference import Reference, open_whole
+from roadgeo.reference.shards import ShardedReference, manifest_path, open_shards
+
+__all__ = ["AnyReference", "digest_of", "open_reference", "swapped_near"]
+
+#: One piece, or shards.
+AnyReference: TypeAlias = Reference | ShardedReference
+
+
+def digest_of(references: Sequence[AnyReference], name: str) -> str:
+    """Return the digest of the reference of that name; of all where none has it, for they were searched in vain."""
+    here = [reference for reference in references if reference.name == name][:1] or references
+    return ", ".join(reference.digest for reference in here if reference.digest)
+
+
+def swapped_near(
+    near: tuple[float, float, float], references: Sequence[AnyReference]
+) -> tuple[float, float, float] | None:
+    """Return a circle (longitude, latitude, metres) the other way round, where only then it touches one of the maps."""
+    lon, lat, radius = near
+    if abs(lon) > 90.0 or _touches(near, references):
+        return None
+    return (lat, lon, radius) if _touches((lat, lon, radius), references) else None
+
+
+def _touches(near: tuple[float, float, float], references: Sequence[AnyReference]) -> bool:
+    return any(part.may_hold(near) for one in references for part in one.parts)
+
+
+def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
+    """Open a reference: REF.gpkg with its REF.index, REF.shards, also at a URL, or one of the library by its name.
+
+    A missing index, or one of an earlier format, is built from the GeoPackage. For shards only the manifest is read;
+    each is opened when it is first searched.
+
+    >>> roadgeo.open_reference("porto.gpkg").name
+    'porto'
+
+    Raises
+    ------
+    IndexFormatError
+        If there is no such reference, or it is damaged, hostile, stale or of another version.
+    """
+    found = resolve_reference(path)
+    manifest = manifest_path(found) if found.is_dir() else None
+    return open_whole(found, say) if manifest is None else open_shards(manifest)
