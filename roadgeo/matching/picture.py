@@ -96,7 +96,7 @@ class Picture:
 
     def _nats(self, matrix: FloatArray, ground: Ground | None = None) -> FloatArray:
         """Return log L by (missing, false)."""
-        gsd_m = sampling(matrix, self.scene.size)
+        gsd_m = self._gsd_m(matrix)
         ground = ground or self._around(matrix, self._fine_cell_m(matrix), 0.0)
         rectified = self._rectify(matrix, ground)
         if rectified is None:
@@ -157,7 +157,7 @@ class Picture:
         apart_m : float
             Least distance between two places of a turn, and from the place itself.
         """
-        scene, gsd_m = self.scene, sampling(matrix, self.scene.size)
+        scene, gsd_m = self.scene, self._gsd_m(matrix)
         missing, false = divmod(int(self._nats(matrix).argmax()), len(_FALSE))
         center, corners = (Homography(matrix).everywhere(points) for points in (scene.center, scene.corners))
         radius_m = float(np.hypot(*(corners - center).T).max())
@@ -190,9 +190,13 @@ class Picture:
                     places.append(self.place(shifted(turned, east_m, north_m), float(near[r, c]) * unit))
         return sorted(places, key=lambda place: -place.log10_likelihood)
 
+    def _gsd_m(self, matrix: FloatArray) -> float:
+        """Return a place's ground sampling, metres per pixel."""
+        return sampling(matrix, self.scene.size)
+
     def _fine_cell_m(self, matrix: FloatArray) -> float:
         """Return the cells by which a place is weighed, metres, no finer than the reduced frame's."""
-        return max(_ROAD_M / 2.0, self.scene.field_scale * sampling(matrix, self.scene.size))
+        return max(_ROAD_M / 2.0, self.scene.field_scale * self._gsd_m(matrix))
 
     def _around(self, matrix: FloatArray, cell_m: float, reach_m: float) -> Ground:
         """Draw the map's roads around a place."""
@@ -202,7 +206,7 @@ class Picture:
     def _rectify(self, matrix: FloatArray, ground: Ground) -> tuple[_Levels, AnyArray, tuple[int, int]] | None:
         """Return the picture's levels on the ground's grid, and its first cell's (column, row); None if too large."""
         scene, cell_m = self.scene, ground.cell_m
-        gsd_m = sampling(matrix, scene.size)
+        gsd_m = self._gsd_m(matrix)
         places = (Homography(matrix).everywhere(scene.corners) - ground.corner) / cell_m
         low = np.floor(places.min(axis=0)).astype(int) - 1
         columns, rows = np.ceil(places.max(axis=0)).astype(int) + 1 - low
