@@ -43,6 +43,7 @@ _LOG = logging.getLogger(__name__)
 
 #: Frames a second of a video that states none, or none that makes sense.
 _USUAL_RATE = 25.0
+_LONG_S = 3600.0  # no flight is filmed with so long a gap: another clock begins
 _HEAD_BYTES = 4096
 
 
@@ -235,9 +236,10 @@ def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 
         # Frames of phones and links come at no fixed rate; where the container states no time, they do.
         stamp_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         now_s = stamp_s + shift_s if stamp_s > 0.0 else at_s + step_s
-        if now_s < at_s - 1e-6:  # two recordings in one file, a link that was cut, or a counter at its end
+        if k and not -1e-6 < now_s - at_s < _LONG_S:  # two recordings in one file, a link that was cut, a counter's end
+            way = "fall back" if now_s < at_s else "jump ahead"
             _LOG.warning(
-                "%s: its time stamps fall back by %.1f s; its times go on from %.1f s", name, at_s - now_s, at_s
+                "%s: its time stamps %s by %.1f s; its times go on from %.1f s", name, way, abs(now_s - at_s), at_s
             )
             shift_s += at_s + step_s - now_s
             now_s = at_s + step_s
