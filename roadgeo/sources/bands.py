@@ -14,7 +14,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
-from roadgeo.roads.thresholds import are_labels
+from roadgeo.roads.thresholds import are_labels, are_patches, are_roads
 from roadgeo.storage.rasters import open_raster, page_of, sidecar_nodata
 
 if TYPE_CHECKING:
@@ -195,10 +195,13 @@ def _palette(dataset: DatasetReader, band: int) -> AnyArray | None:
         return None
     colours = dataset.colormap(band)
     palette = np.array([colours.get(value, (0, 0, 0, 255)) for value in range(256)], np.uint8)
-    used = np.unique(dataset.read(band))
+    values = dataset.read(band)
+    used = np.unique(values)
     shown = palette[used, :3]
-    is_picture = len(used) > _MAX_CLASSES or (shown == shown[:, :1]).all()  # or greys
-    return palette if is_picture and not are_labels(used) else None
+    if (shown == shown[:, :1]).all() and not are_labels(used):  # greys
+        return palette
+    are_instances = are_patches(values, values > 0) and are_roads(values > 0)  # each of a colour
+    return palette if len(used) > _MAX_CLASSES and not are_labels(used) and not are_instances else None
 
 
 def _labels(names: Sequence[str]) -> tuple[str, ...]:

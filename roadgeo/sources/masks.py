@@ -163,7 +163,7 @@ def open_mask(
         _require_mask(raster)
         if choice.road_class is not None:
             raster = _of_class(raster, choice.road_class)
-        raster = _without_fill(raster)
+        raster = _of_colours(_without_fill(raster))
         seen, hidden = _sample(raster)
         if len(hidden):
             raster = _drawn(raster, seen, hidden)
@@ -265,6 +265,21 @@ def _without_fill(raster: Raster) -> Raster:
             _LOG.warning("%s: its value %g, far from all others, is taken for not observed", visible(raster.name), end)
             return _changed(raster, partial(_known_but, end))
     return raster
+
+
+def _of_colours(raster: Raster) -> Raster:
+    """Take all but black for road where each road has a colour of its own."""
+    if len(raster.bands) == 1:
+        return raster
+    values, valid = _middle(raster)
+    shown = (values > 0).any(axis=2) & _finite(values, valid)
+    if values.dtype.kind not in "iu" or not np.ptp(values[shown], axis=1).any() or not are_roads(shown):
+        return raster
+    if not are_patches(values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]], shown):
+        return raster
+    _LOG.warning("%s: holds a colour for each of its roads: all but black is road", visible(raster.name))
+    drawn = _changed(raster, lambda values, valid: ((values > 0).any(axis=2).view(np.uint8)[..., None], valid))
+    return replace(drawn, bands=raster.bands[:1])
 
 
 def _known_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:

@@ -281,8 +281,8 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
                 f"{name}: is text, whatever its name says; expected an image of a format that is read ({_NAMES})"
             )
         raise MaskError(
-            f"{name}: not a raster of a format that is read here ({_NAMES}); convert it to GeoTIFF, "
-            f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
+            f"{name}: not a raster of a format that is read here ({_NAMES}); convert it to GeoTIFF (of a video "
+            f"`roadgeo track` takes frames), or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
         )
     return [driver] if driver else more
 

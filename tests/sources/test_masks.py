@@ -711,14 +711,14 @@ def numbered(roads: np.ndarray, kind: str) -> np.ndarray:
 NUMBERED = ["instances", "many", "lanes", "speeds", "years", "float years"]
 
 
-@pytest.mark.parametrize("container", ["array", "tif", "png", "nodata", "masked", "rgb"])
+@pytest.mark.parametrize("container", ["array", "tif", "png", "nodata", "masked", "rgb", "colours", "palette"])
 @pytest.mark.parametrize("kind", NUMBERED)
 def test_numbers_above_0_are_road(
     roads: np.ndarray, kind: str, container: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     values = numbered(roads, kind)
-    if container == "png" and kind == "float years":
-        pytest.skip("no such PNG")
+    if (container == "png" and kind == "float years") or (container == "palette" and "years" in kind):
+        pytest.skip("no such file")
     path = tmp_path / "a.png"
     if container == "png":
         cv2.imwrite(str(path), values)
@@ -726,6 +726,13 @@ def test_numbers_above_0_are_road(
         "array": lambda: values,
         "masked": lambda: np.ma.masked_equal(values, 0),
         "rgb": lambda: np.dstack([values] * 3),
+        "colours": lambda: (
+            np.random.default_rng(1).integers(1, 256, (4000, 3)).astype(np.uint8)[values.astype(int)]
+            * (values > 0).astype(np.uint8)[..., None]
+        ),
+        "palette": lambda: write_raster(
+            tmp_path / "a.tif", values, colors={k: (k * 37 % 256, k * 91 % 256, 9, 255) for k in range(256)}
+        ),
         "png": lambda: path,
         "tif": lambda: write_raster(tmp_path / "a.tif", values),
         "nodata": lambda: write_raster(tmp_path / "a.tif", values, nodata=0),
