@@ -278,7 +278,7 @@ def _of_colours(raster: Raster) -> Raster:
     if not are_patches(values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]], shown):
         return raster
     _LOG.warning("%s: holds a colour for each of its roads: all but black is road", visible(raster.name))
-    drawn = _changed(raster, lambda values, valid: ((values > 0).any(axis=2).view(np.uint8)[..., None], valid))
+    drawn = _changed(raster, lambda values, valid: (np.any(values > 0, axis=2, keepdims=True).view(np.uint8), valid))
     return replace(drawn, bands=raster.bands[:1])
 
 

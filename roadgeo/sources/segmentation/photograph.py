@@ -91,13 +91,14 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
             )
         chosen = _choose_bands(dataset, name) if bands is None else _require_bands(dataset, name, bands)
         stretch = _find_stretch(dataset, chosen, name)
+        turn = 255 if dataset.tags(ns="IMAGE_STRUCTURE").get("MINISWHITE") == "YES" else 0  # a negative, by its tag
 
         @lru_cache(maxsize=1)  # where there is ground is found first, and a picture of one tile is that read again
         def read(
             left: float, top: float, width: float, height: float, shape: tuple[int, int]
         ) -> tuple[AnyArray, BoolArray]:
             values, valid = _read(dataset, chosen, (left, top, width, height), shape)
-            return stretch(values), valid
+            return stretch(values) ^ np.uint8(turn), valid
 
         yield Photograph(name, dataset.width, dataset.height, read, page_of(dataset))
 

@@ -298,3 +298,13 @@ def test_a_fill_that_no_file_declares_is_no_ground(tmp_path: Path, kind: str, fi
     assert not ground[:, :115].any()
     assert ground[:, 130:].all()
     assert np.ptp(rgb[:, 130:]) > 130
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16"])
+def test_a_negative_by_its_tag_is_shown_as_viewers_do(tmp_path: Path, kind: str) -> None:
+    values = np.tile(np.linspace(1, 254, 150), (120, 1)).astype(kind)
+    path = write_raster(tmp_path / "a.tif", values, photometric="MINISWHITE")
+    with open_photograph(path) as opened:
+        rgb, _ = opened.read(0.0, 0.0, 150.0, 120.0, (120, 150))
+    assert rgb[60, 10, 0] > 200
+    assert rgb[60, 140, 0] < 55
