@@ -10,11 +10,12 @@ from roadgeo.errors import MaskError
 from roadgeo.storage.orientation import read_tag
 from roadgeo.storage.rasters import open_raster, raster_size
 
-__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length", "read_time"]
+__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length", "read_position", "read_time"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
 _FOCAL = "EXIF_FocalLengthIn35mmFilm"
+_GPS = 0x8825
 _EXIF, _TAKEN, _PART_OF_SECOND = 0x8769, 0x9003, 0x9291
 
 
@@ -72,6 +73,17 @@ def read_time(path: str | os.PathLike[str]) -> float | None:
     except ValueError:
         return None
     return moment.timestamp() + _number(f"0.{part or 0}")
+
+
+def read_position(path: str | os.PathLike[str]) -> tuple[float, float] | None:
+    """Return longitude and latitude of the camera, as EXIF states them; None where it does not, or has zeros."""
+    south, lats, west, lons = (read_tag(path, tag, _GPS) for tag in (1, 2, 3, 4))
+    if not (isinstance(lats, tuple) and isinstance(lons, tuple)):
+        return None
+    lat, lon = (sum(part / 60.0**k for k, part in enumerate(angle)) for angle in (lats, lons))
+    if not (0.0 <= lat <= 90.0 and 0.0 <= lon <= 180.0 and lat + lon > 0.0):
+        return None
+    return -lon if west == "W" else lon, -lat if south == "S" else lat
 
 
 def _tags(path: str | os.PathLike[str]) -> tuple[dict[str, str], str]:

@@ -11,6 +11,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
+from roadgeo.sources.exif import read_position
 from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
 from roadgeo.storage.rasters import open_raster
@@ -61,10 +62,13 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
 
 
 def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | None:
-    """Return longitude and latitude of the middle of a raster by its own georeference; None where it has none."""
+    """Return longitude and latitude of the middle of a raster by its own georeference, or of its camera by EXIF.
+
+    None where it has neither.
+    """
     found = _stated(path)
     middle = found.middle() if found is not None else (np.nan, np.nan)
-    return middle if np.isfinite(middle).all() else None
+    return middle if np.isfinite(middle).all() else read_position(path)
 
 
 def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:

@@ -57,7 +57,7 @@ def test_where_the_scale_is_not_known_one_serves_all(model: FrameOptions, photog
 
 def test_a_photograph_without_roads_is_a_frame_of_the_flight(model: FrameOptions, tmp_path: Path) -> None:
     path = tmp_path / "sea.png"
-    cv2.imwrite(str(path), np.random.default_rng(0).integers(20, 60, (300, 400, 3)).astype(np.uint8))
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(20, 100, (300, 400, 3)).astype(np.uint8))
     (frame,) = read_frames([str(path)], replace(model, reading=replace(model.reading, segment="always")))
     assert frame.mask.roads.shape == (300, 400)
     assert not frame.mask.roads.any()

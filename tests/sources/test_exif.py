@@ -7,7 +7,8 @@ from click.testing import CliRunner
 
 from roadgeo.cli import cli
 from roadgeo.errors import MaskError
-from roadgeo.sources.exif import read_focal_length
+from roadgeo.sources.exif import read_focal_length, read_position
+from roadgeo.sources.georeference import read_stated_middle
 
 
 def jpeg_with_exif(path, focal_mm):
@@ -38,3 +39,24 @@ def test_what_is_no_focal_length_is_a_usage_error(wrong):
     result = CliRunner().invoke(cli, ["locate", "mask.png", "--focal", wrong])
     assert result.exit_code == 2
     assert "expected pixels above 0, or exif" in result.output
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize(
+    ("stated", "place"),
+    [
+        (("N", (41.0, 9.0, 45.0), "W", (8.0, 37.0, 44.4)), (-8.629, 41.1625)),
+        (("S", (33.0, 51.0, 0.0), "E", (151.0, 12.0, 36.0)), (151.21, -33.85)),
+        (("N", (0.0, 0.0, 0.0), "E", (0.0, 0.0, 0.0)), None),  # no fix
+        (("N", (95.0, 0.0, 0.0), "E", (8.0, 0.0, 0.0)), None),
+        (None, None),
+    ],
+)
+def test_the_camera_says_where_it_is(tmp_path, suffix, stated, place):
+    exif = PIL.Image.Exif()
+    if stated:
+        exif[0x8825] = dict(enumerate(stated, 1))
+    PIL.Image.new("RGB", (90, 60)).save(tmp_path / f"a.{suffix}", exif=exif)
+    for read in (read_position, read_stated_middle):
+        found = read(tmp_path / f"a.{suffix}")
+        assert found == (None if place is None else pytest.approx(place, abs=1e-6))
