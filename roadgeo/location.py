@@ -312,7 +312,7 @@ class Location:
 
     @cached_property
     def stated_offset_m(self) -> float | None:
-        """How far the middle lies from where the image's own georeference puts it; None where it has none."""
+        """How far the middle lies from where the image's own georeference, or EXIF, puts it; None where it has none."""
         if self.center is None or self.content is None or self.content.stated is None:
             return None
         from pyproj import Geod

@@ -289,7 +289,7 @@ def describe(outcome: Outcome) -> str:
     if found.get("part_read"):
         text += f"\n  read {visible(found['part_read'])}"
     if found.get("stated_offset_m") is not None:
-        text += f"\n  its own georeference puts the middle {found['stated_offset_m']:,.1f} m from there"
+        text += f"\n  its own georeference, or EXIF, puts the middle {found['stated_offset_m']:,.1f} m from there"
     if outcome.photo and outcome.photo[0] != found["query"]:
         text += f"\n  drew {visible(outcome.photo[0])}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:
