@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import re
 
-__all__ = ["counted", "visible"]
+__all__ = ["counted", "in_html", "visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -20,6 +21,11 @@ def visible(text: str, *, lines: bool = False) -> str:
             part if part in ("\n", "\t") else _UNSEEN.sub(_escape, part) for part in re.split("([\n\t])", text)
         )
     return _UNSEEN.sub(_escape, re.sub("[\r\n\t]+", " ", text))
+
+
+def in_html(text: str) -> str:
+    """Return text for a page, or for other XML: as it is shown, with what would be markup."""
+    return html.escape(visible(text, lines=True))
 
 
 def counted(number: int, noun: str) -> str:

@@ -12,10 +12,12 @@ import threading
 import webbrowser
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo.cli import TERMINATED
 from roadgeo.cli.fencing import fence_of
 from roadgeo.cli.options import OTHERS, Command, each, n_threads, open_maps, row, take
 from roadgeo.cli.printing import echo, is_set
@@ -50,7 +52,7 @@ Examples:
   ROADGEO_TOKEN=secret roadgeo serve --host 0.0.0.0 --jobs 4
   roadgeo serve --mavlink udpout:127.0.0.1:14550
 
-Exit status: 0 ended, 1 error, 2 usage.
+Exit status: 0 ended, 1 error, 2 usage, 143 ended by SIGTERM.
 \f
 
 \b
@@ -149,7 +151,13 @@ def serve_command(
     echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
     if not no_browser and _has_screen():
         threading.Timer(0.5, webbrowser.open, [address]).start()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    ended_by: list[int] = []
+
+    def end(number: int, _: FrameType | None) -> None:
+        ended_by.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, end)
     _log()
     try:
         server.serve_forever()
@@ -159,7 +167,7 @@ def serve_command(
         server.close()
         if sender is not None:
             sender.close()
-    return 0
+    return TERMINATED if ended_by else 0
 
 
 def _has_screen() -> bool:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from roadgeo._text import in_html
 from roadgeo.evaluation.scoring import Evaluation, Score, Share, Spread, Summary
 from roadgeo.evaluation.truth import Truth
 from roadgeo.geometry.frame import Frame
@@ -127,7 +127,7 @@ def render_report(
         The map, or its parts that the masks lie on, to draw its roads.
     """
     settings = ", ".join(f"{name} {_text(value)}" for name, value in evaluation.settings.items())
-    parts = ["".join(f"<p>{html.escape(line)}</p>" for line in verdicts(evaluation))]
+    parts = ["".join(f"<p>{in_html(line)}</p>" for line in verdicts(evaluation))]
     for by, groups in evaluation.breakdowns.items():
         parts.append(
             section(TITLES[by], _table(*summary_table([*groups, evaluation.total] if by == "kind" else groups)))
@@ -146,7 +146,7 @@ def _text(value: object) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return table(heads, (map(html.escape, row) for row in rows))
+    return table(heads, (map(in_html, row) for row in rows))
 
 
 def _lost(scores: Sequence[Score]) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from html import escape
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from roadgeo._text import in_html
 from roadgeo._version import __version__
 from roadgeo.flights.rows import Row
 from roadgeo.outputs.names import table_cell, table_text
@@ -88,7 +88,7 @@ def to_gpx(rows: Sequence[Row]) -> str:
     def point(row: Row) -> str:
         lon, lat = row.center or (math.nan, math.nan)
         when = "" if row.time is None else f"<time>{row.to_dict()['time']}</time>"
-        about = f"{when}<name>{escape(row.name)}</name><type>{row.status}</type>"
+        about = f"{when}<name>{in_html(row.name)}</name><type>{row.status}</type>"
         return f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}">{about}</trkpt>'
 
     body = "".join(f"<trkseg>{''.join(map(point, run))}</trkseg>" for run in _runs(rows, 1))

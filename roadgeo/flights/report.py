@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections import Counter
@@ -12,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo._text import in_html
 from roadgeo.flights.rows import Row
 from roadgeo.flights.tracker import Tracked
 from roadgeo.geometry.mask import RoadMask
@@ -95,7 +95,7 @@ def render_flight(
     text = f"{len(rows)} frames: {states}"
     reference = _usual_map(tracked)
     if reference is None:
-        why = html.escape(rows[-1].reason if rows else "no frames")
+        why = in_html(rows[-1].reason if rows else "no frames")
         return render_page(title, text, "", [f"<p>The flight was not located: {why}</p>"])
     # Footprints in metres from the corner of the map that is shown.
     maps = [frame.reference for frame in tracked]

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from roadgeo._text import visible
 from roadgeo.errors import OutputError
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.names import name_for_odm, table_text
@@ -64,6 +65,8 @@ def _write_vrt(path: Path, subject: Subject, folder: Path) -> None:
             raise OutputError(f"{subject.picture}: GDAL does not read it where it lies; save it as GeoTIFF")
     with open_raster(subject.picture.absolute(), upright=False) as source, writing_raster(path):
         rasterio.shutil.copy(source, path, driver="VRT")
+    if visible(subject.picture.name) != subject.picture.name:
+        raise OutputError(f"{subject.picture}: XML holds no such name; rename the picture")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()
     for source in root.iter("SourceFilename"):

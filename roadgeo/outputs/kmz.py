@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from roadgeo._text import in_html
 from roadgeo.errors import OutputError
 from roadgeo.geometry.antimeridian import cut_ring, unwrap_ring
 from roadgeo.geometry.warping import MapGrid
@@ -61,8 +61,8 @@ def _kml(subject: Subject, grid: MapGrid) -> str:
     south = grid.north - grid.height * grid.resolution
     rings = [" ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in ring) for ring in cut_ring(subject.outline())]
     polygons = "\n".join(map(_KML_POLYGON.format, rings))
-    name = html.escape(subject.paths.stem)
-    text = html.escape(f"{subject.location.reason}. {subject.location.attribution}".strip())
+    name = in_html(subject.paths.stem)
+    text = in_html(f"{subject.location.reason}. {subject.location.attribution}".strip())
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2">
 <Document><name>{name}</name><description>{text}</description>

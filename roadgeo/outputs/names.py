@@ -56,9 +56,10 @@ def table_cell(text: str) -> str:
 
 
 def table_text(rows: Iterable[Iterable[object]]) -> str:
-    """Return rows of cells as CSV."""
+    """Return rows of cells as CSV; control characters in texts are shown."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    shown = ([visible(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(shown)
     return text.getvalue()
 
 

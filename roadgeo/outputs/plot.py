@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from roadgeo._text import in_html
 from roadgeo.errors import OutputError
 from roadgeo.outputs.drawing.layers import Layer
 from roadgeo.outputs.drawing.raster import Canvas, write_png
@@ -43,7 +43,7 @@ class Plot:
         width, height = _WIDTH_PX, round(_WIDTH_PX * self.height_m / self.width_m)
         per_px = self.width_m / _WIDTH_PX
         at = f'x="{6 * per_px:.4g}" y="{self.height_m - 6 * per_px:.4g}"'
-        credit = f'<text {at} style="font-size:{12 * per_px:.4g}px">{html.escape(self.credit)}</text>'
+        credit = f'<text {at} style="font-size:{12 * per_px:.4g}px">{in_html(self.credit)}</text>'
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
             f'viewBox="0 0 {self.width_m:.1f} {self.height_m:.1f}" style="--u:{per_px:.4g};background:var(--paper)">'

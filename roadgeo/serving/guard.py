@@ -21,6 +21,8 @@ __all__ = ["COOKIE", "Guard", "is_same", "pass_of", "problem"]
 
 #: Under this name a browser shows that it was given the token.
 COOKIE = "roadgeo"
+#: Wrong tokens, of all who ask, are answered one after another, so long after each other, seconds.
+_GUESS_S = 0.5
 #: Longest body of a request that brings a token.
 _TOKEN_BYTES = 4096
 
@@ -44,13 +46,16 @@ class Guard:
     """Lets through who may ask, within the limits of a body, and gives all answers their common headers."""
 
     def __init__(self, app: ASGIApp, options: ServeOptions) -> None:
-        self._app, self._options = app, options
+        self._app, self._options, self._guesses = app, options, asyncio.Lock()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
 
         async def send_all(message: Message) -> None:
             if message["type"] == "http.response.start":
+                if message["status"] == HTTPStatus.UNAUTHORIZED:
+                    async with self._guesses:
+                        await asyncio.sleep(_GUESS_S)
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
@@ -72,7 +77,9 @@ class Guard:
                 raise HTTPException(401, "expected the header Authorization: Bearer TOKEN")
         elif _split("//" + host)[1] not in LOOPBACK:  # other names may be tricks of a page in a browser
             raise HTTPException(403, "this server answers to localhost and 127.0.0.1 only")
-        if origin and _split(origin)[0] != host.lower():
+        # Who has a token is behind a proxy, perhaps, that speaks https to browsers.
+        schemes = ("http", "https") if self._options.token else ("http",)
+        if origin and origin.lower() not in [f"{scheme}://{host.lower()}" for scheme in schemes]:
             raise HTTPException(403, "this server does not answer to pages of other sites")
         if int(headers.get("content-length", 0)) > most:
             raise HTTPException(413, f"a body of {headers['content-length']} bytes, expected at most {most:,}")

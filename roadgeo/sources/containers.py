@@ -46,11 +46,11 @@ _PEEK = 1000
 #: What services write into an answer that is a part of what was asked for: ArcGIS, WFS, OGC API - Features.
 _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d{1,12})")
 _LIMITED = re.compile(
-    rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^>]*\bnext\s*=\s*[\"']\w"
+    rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^<>]*\bnext\s*=\s*[\"']\w"
 )
 #: Formats of a feature a line; and the name of an XML file's outermost element, behind what may come before it.
 _BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
-_ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*(?:<[?!].*?>\s*)*<([\w:.-]+)"), 1 << 12
+_ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*+(?:<[?!].*?>\s*+)*+<([\w:.-]+)"), 1 << 12
 _ENDS_BYTES = 1 << 16  # of a file, where it says so
 _TILES = "vector tiles, which cut roads at their borders and simplify them; give the data that they were made of"
 #: Formats that are not read, and what their users do.

@@ -28,9 +28,11 @@ OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", 
 #: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
 _NODES_IN_MEMORY = 100_000_000
 #: An object that JOSM's user has deleted stays in its file.
-_DELETED = re.compile(rb"<way\b(?=[^>]*\baction=[\"']delete)[^>]*\bid=[\"'](-?\d{1,18})[\"']")
+#: Each pattern here gives up at the next tag: what has no end is looked at once, not once for each beginning.
+_WAY = re.compile(rb"<way\b([^<>]*+)")
+_IS_DELETED, _ID = re.compile(rb"\baction=[\"']delete"), re.compile(rb"\bid=[\"'](-?\d{1,18})[\"']")
 #: Overpass ends an answer so that it could not complete.
-_REMARK = re.compile(rb"<remark>\s*([^<]{1,200}?)\s*</remark>")
+_REMARK = re.compile(rb"<remark>\s*+([^<]++)</remark>")
 GAVE_UP, ASK_LESS = "says that it is not whole", "ask for a smaller area, or again"
 _MOST_TAG = 4096
 
@@ -209,9 +211,11 @@ def _deleted_ways(path: Path) -> set[int]:
     for chunk in read_chunks(path):
         text = tail + chunk
         if b"delete" in text:
-            found |= {int(number) for number in _DELETED.findall(text)}
+            deleted = (_ID.search(tag) for tag in _WAY.findall(text) if _IS_DELETED.search(tag))
+            found |= {int(number[1]) for number in deleted if number}
         if remark := _REMARK.search(text):
-            raise RoadSourceError(f"{path}: {GAVE_UP}: {remark[1].decode('utf-8', 'replace').rstrip('.')}; {ASK_LESS}")
+            said = remark[1].decode("utf-8", "replace")[:200].strip(" .")
+            raise RoadSourceError(f"{path}: {GAVE_UP}: {said}; {ASK_LESS}")
         tail = text[-_MOST_TAG:]
     return found
 

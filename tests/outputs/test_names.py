@@ -9,8 +9,9 @@ import pytest
 import rasterio
 from worlds.demo import DRONE
 
+from roadgeo._text import in_html
 from roadgeo.cli import main
-from roadgeo.outputs.names import bare_command, bare_name, bare_names, without_folders
+from roadgeo.outputs.names import bare_command, bare_name, bare_names, table_text, without_folders
 from roadgeo.outputs.registry import ALSO
 
 
@@ -85,3 +86,8 @@ def _content(path: Path) -> bytes:
         return path.read_bytes()
     with zipfile.ZipFile(path) as packed:
         return b"".join(map(packed.read, packed.namelist()))
+
+
+def test_control_characters_are_shown_in_tables_and_pages() -> None:
+    assert table_text([["a\x1b[31m\u202egnp", 1]]) == "a\\x1b[31m\\u202egnp,1\n"
+    assert in_html("<b>\x1b\u202e") == "&lt;b&gt;\\x1b\\u202e"

@@ -9,6 +9,7 @@ import socket
 import struct
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -162,6 +163,23 @@ def test_what_is_wrong_is_said(method, path, body, headers, status):
         assert answer.status == status
         assert document["status"] == status
         assert document["detail"]
+
+
+def test_an_origin_is_of_the_scheme_too():
+    with serving() as server:
+        for scheme, status in (("http", 200), ("https", 403), ("ftp", 403)):
+            origin = {"Origin": f"{scheme}://127.0.0.1:{server.server_port}"}
+            assert ask(server, "POST", "/locate", PNG, origin)[0].status == status
+
+
+def test_guesses_at_the_token_are_answered_one_after_another():
+    with serving(token="open sesame") as server, ThreadPoolExecutor(4) as threads:
+        started = time.monotonic()
+        guesses = [threads.submit(ask, server, "POST", "/session", b"guess") for _ in range(4)]
+        assert ask(server, "POST", "/session", b"open sesame")[0].status == 200
+        assert time.monotonic() - started < 1.5
+        assert {guess.result()[0].status for guess in guesses} == {401}
+        assert time.monotonic() - started > 1.9
 
 
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"

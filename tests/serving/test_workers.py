@@ -303,3 +303,14 @@ def test_others_may_ask_with_a_token_only(options):
 def test_a_basemap_is_an_address_of_tiles(url, capsys):
     assert main(["serve", "--basemap", url]) == 2
     assert "{z}/{x}/{y}" in capsys.readouterr().err
+
+
+def test_a_supervisor_that_ends_it_is_told_so(place):
+    folder, _ = place
+    command = [*SERVE, "--reference", str(folder / "town.gpkg"), "--port", "0", "--no-browser"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        assert server.stderr is not None
+        while "Listening" not in server.stderr.readline():
+            assert server.poll() is None
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(30) == 128 + signal.SIGTERM

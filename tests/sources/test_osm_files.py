@@ -1,6 +1,7 @@
 """OpenStreetMap files of every shape give the same streets."""
 
 import gzip
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from worlds.fenway import elements, streets
 from worlds.osm_files import o5m, osm_texts, overpass_answers
 
 from roadgeo.errors import RoadSourceError
+from roadgeo.sources.osm_files import _deleted_ways
 from roadgeo.sources.roads import read_roads
 from roadgeo.sources.streams import read_lines
 
@@ -94,3 +96,21 @@ def test_other_answers_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(RoadSourceError, match=r"a\.json"):
         read_roads(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"<osm><remark>" + b" " * 1_000_000,
+        b"<remark> " * 100_000,
+        b"delete" + b"<way " * 200_000,
+        b"<way action='delete' " * 50_000,
+    ],
+    ids=["blanks", "remarks", "ways", "deleted"],
+)
+def test_what_has_no_end_is_looked_at_once(content: bytes, tmp_path: Path) -> None:
+    """Squares of the size: 10 kB of blanks took 40 s."""
+    (tmp_path / "a.osm").write_bytes(content)
+    started = time.process_time()
+    assert _deleted_ways(tmp_path / "a.osm") == set()
+    assert time.process_time() - started < 1.0

@@ -5,6 +5,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -26,7 +27,7 @@ from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import name_page, open_raster, page_of, raster_size, writing_raster
+from roadgeo.storage.rasters import name_page, open_raster, page_of, raster_size, sidecar_nodata, writing_raster
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -420,6 +421,14 @@ def test_a_cause_is_named_where_something_speaks_for_it(
         raise rasterio.errors.RasterioError(reason)
     reported = str(raised.value)
     assert f"{reason}; {doubt}" in reported if doubt else reported.endswith(reason)
+
+
+@pytest.mark.parametrize("text", [b"<NoDataValue" * 80_000, b"<NoDataValue>" + b" " * 1_000_000])
+def test_what_has_no_end_beside_a_raster_is_looked_at_once(text: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.png.aux.xml").write_bytes(text)
+    started = time.process_time()
+    assert sidecar_nodata(tmp_path / "a.png") is None
+    assert time.process_time() - started < 1.0
 
 
 def test_text_that_is_called_an_image_is_said_to_be_text(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import math
 from collections.abc import Sequence
 from urllib.parse import quote
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._text import in_html
 from roadgeo.outputs.drawing.layers import (
     LOOKS,
     PALETTE,
@@ -105,7 +105,7 @@ def _draw_mark(mark: Mark) -> str:
             return _draw_circles(centers, radii, texts)
         case Cross(at, text):
             cross = '<path d="M-9-9L9 9M-9 9L9-9"/>'
-            return _fixed(at, f'{cross}<text x="13" y="5">{html.escape(text)}</text>')
+            return _fixed(at, f'{cross}<text x="13" y="5">{in_html(text)}</text>')
 
 
 def draw_sign(layer: Layer) -> str:
@@ -142,14 +142,14 @@ def _draw_ring(ring: Ring) -> str:
     if not np.isfinite(ring.corners).all():
         return ""
     number = "" if ring.number is None else f' data-number="{ring.number}"'
-    title = f"<title>{html.escape(ring.title)}</title>" if ring.title else ""
+    title = f"<title>{in_html(ring.title)}</title>" if ring.title else ""
     drawn = f'<path d="{ring_data(ring.corners)}"{number}>{title}</path>'
     if ring.up:
         left, right = ring.corners[:2]
         turn = math.degrees(math.atan2(right[1] - left[1], right[0] - left[0]))
         up = f'<g transform="rotate({turn:.1f})"><path class="up" d="M-11 0L0-14L11 0z"/></g>'
         drawn += _fixed((left + right) / 2, up)
-    return f'<a href="{html.escape(quote(ring.link))}">{drawn}</a>' if ring.link else drawn
+    return f'<a href="{in_html(quote(ring.link))}">{drawn}</a>' if ring.link else drawn
 
 
 def _draw_arrows(at: FloatArray, steps: FloatArray) -> str:
@@ -168,7 +168,7 @@ def _draw_circles(centers: FloatArray, radii: FloatArray, texts: Sequence[str]) 
     """Draw circles that the style sheet enlarges like the arrows."""
     return "".join(
         f'<g transform="translate({x:.2f} {y:.2f})"><circle r="{radius:.3g}"/>'
-        f'<g class="fixed"><text x="8" y="-8">{html.escape(text)}</text></g></g>'
+        f'<g class="fixed"><text x="8" y="-8">{in_html(text)}</text></g></g>'
         for (x, y), radius, text in zip(centers.tolist(), radii.tolist(), texts, strict=True)
         if math.isfinite(x + y + radius)
     )

@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from roadgeo._text import counted
+from roadgeo._text import counted, in_html
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.drawing.layers import Layer, Ring
@@ -126,6 +126,6 @@ def _item(entry: Entry, with_folder: bool) -> str:
             parts.append(f"corners {write_sigma(max(sigma))}")
         if odds is not None:
             parts.append(f"score {odds:z.1f}")
-    text = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
+    text = " · ".join(parts) or in_html(str(attributes(document)["reason"]))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
-    return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{text}</small></li>"
+    return f"<li>{entry.wrap(in_html(name or 'mask'))} {status}<br><small>{text}</small></li>"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roadgeo._text import counted
+from roadgeo._text import counted, in_html
 from roadgeo._version import __version__
 from roadgeo.geometry.frame import polygon_area
 from roadgeo.geometry.mask import plane_to_pixel
@@ -110,7 +110,7 @@ def render_page(
         Name of a status, by which it is coloured, and how it is shown beside the heading.
     """
     badge = "" if status is None else f'<span class="status {status[0]}">{status[1]}</span>'
-    credit = f"Map: {html.escape(attribution)}. " if attribution else ""
+    credit = f"Map: {in_html(attribution)}. " if attribution else ""
     style, script = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     allowed = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     return f"""<!DOCTYPE html>
@@ -121,13 +121,13 @@ def render_page(
 <meta http-equiv="Content-Security-Policy" content="{allowed}">
 <meta name="generator" content="roadgeo {__version__}">
 <link rel="icon" href="data:,">
-<title>{html.escape(title)}</title>
+<title>{in_html(title)}</title>
 <style>
 {stylesheet()}{style}</style>
 <noscript><style>.buttons, .legend input {{ display: none }}</style></noscript>
 </head>
 <body>
-<header><h1>{html.escape(title)}</h1>{badge}<p>{html.escape(text)}</p></header>
+<header><h1>{in_html(title)}</h1>{badge}<p>{in_html(text)}</p></header>
 <main>{view}<aside>{"".join(parts)}
 <footer>{credit}Made by roadgeo {__version__}. This file needs no network.</footer></aside></main>
 <script>
@@ -145,19 +145,19 @@ def name_owners(indexes: Iterable[ReferenceIndex]) -> str:
 
 def section(title: str, content: str) -> str:
     """Put a heading over HTML; nothing for nothing."""
-    return f"<section><h2>{html.escape(title)}</h2>{content}</section>" if content else ""
+    return f"<section><h2>{in_html(title)}</h2>{content}</section>" if content else ""
 
 
 def label_values(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of labels and values (HTML)."""
-    body = "".join(f'<tr><th scope="row">{html.escape(label)}</th><td>{value}</td></tr>' for label, value in rows)
+    body = "".join(f'<tr><th scope="row">{in_html(label)}</th><td>{value}</td></tr>' for label, value in rows)
     return f'<table class="numbers">{body}</table>'
 
 
 def table(heads: Iterable[str], rows: Iterable[Iterable[str]], name: str = "") -> str:
     """Return heads and cells (HTML) as a table that is scrolled."""
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    head = "".join(f'<th scope="col">{html.escape(text)}</th>' for text in heads)
+    head = "".join(f'<th scope="col">{in_html(text)}</th>' for text in heads)
     whole = f'<table class="{name}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
     return f'<div class="scroll" tabindex="0">{whole}</div>'
 
@@ -201,7 +201,7 @@ def _draw_overview(subject: Subject) -> str:
     """Draw all of the map, and where on it the mask and the runner-up lie."""
     index, location = subject.index, subject.location
     if index.name != location.reference:  # several were searched
-        return f"<p>Searched: {html.escape(location.reference)}.</p>"
+        return f"<p>Searched: {in_html(location.reference)}.</p>"
     picture, window = whole_map(index, subject.views.overview_bytes, 2 * _OVERVIEW_PX)
     layers = [picture]
     if subject.has_place:
@@ -217,9 +217,9 @@ def _draw_overview(subject: Subject) -> str:
     text = f"All of the map {index.name}" + (", with the footprint" if subject.has_place else "")
     box = " ".join(f"{value:.0f}" for value in window.box)
     return (
-        f'<svg class="overview" viewBox="{box}" role="img" aria-label="{html.escape(text)}" '
+        f'<svg class="overview" viewBox="{box}" role="img" aria-label="{in_html(text)}" '
         f'style="--u:{window.width / _OVERVIEW_PX:.4g}">{"".join(map(draw_layer, layers))}</svg>'
-        f'<p class="faint">{html.escape(index.name)}: {len(index):,} intersections, '
+        f'<p class="faint">{in_html(index.name)}: {len(index):,} intersections, '
         f"{window.width / 1000:.0f} × {window.height / 1000:.0f} km</p>"
     )
 
@@ -263,7 +263,7 @@ def _advice(subject: Subject) -> list[str]:
         _listed(places),
         f"{counted(n, 'intersection')} {'is' if n == 1 else 'are'} seen in the {called}{few}.",
         f"Do the coloured lines follow its roads? If not, a cleaner {called}, --threshold or --band may help.",
-        f"Was the right map searched? It was {html.escape(location.reference)}.",
+        f"Was the right map searched? It was {in_html(location.reference)}.",
         f"Whatever is known shortens the search and may save a {called}: --near, --gsd, --north-up, --max-tilt.",
     ]
 
@@ -315,7 +315,7 @@ def _numbers(subject: Subject) -> list[tuple[str, str]]:
     if location.rotation_deg is not None:
         rows.append(("Image's up", f"{round(location.rotation_deg) % 360}° clockwise from north"))
     if location.tilt_deg is not None:
-        source = f" <small>({html.escape(location.tilt_source)})</small>" if location.tilt_source else ""
+        source = f" <small>({in_html(location.tilt_source)})</small>" if location.tilt_source else ""
         rows.append(("Tilt", f"{location.tilt_deg:.1f}° from the vertical{source}"))
     sigma = location.corner_sigma_m
     if sigma is not None and np.isfinite(sigma).all():
@@ -353,7 +353,7 @@ def _corners(subject: Subject) -> str:
         where += f"<br><small>{xy[0]:,.1f}, {xy[1]:,.1f}</small>"
         rows.append(f"<tr><td>{show}</td><td>{where}</td><td>{write_sigma(s) or '–'}</td></tr>")
     crs = place.crs if place.crs.upper().startswith("EPSG:") else "a plane of its own, see below"
-    return f'<table>{"".join(rows)}</table><p class="faint">Metres in {html.escape(crs)}</p>'
+    return f'<table>{"".join(rows)}</table><p class="faint">Metres in {in_html(crs)}</p>'
 
 
 def _matches(subject: Subject) -> str:
@@ -383,17 +383,17 @@ def _details(subject: Subject) -> list[tuple[str, str]]:
     plain = location.to_dict()
     seconds = ", ".join(f"{step} {value:.3f}" for step, value in plain["seconds"].items())
     stats = ", ".join(f"{value:,} {name.replace('_', ' ')}" for name, value in plain["stats"].items())
-    rows = [("Mask", html.escape(bare_name(location.query))), ("Map", html.escape(location.reference))]
-    rows += [("Source", html.escape(text)) for text in _sources(subject.index)]
+    rows = [("Mask", in_html(bare_name(location.query))), ("Map", in_html(location.reference))]
+    rows += [("Source", in_html(text)) for text in _sources(subject.index)]
     rows += [("Seconds", seconds), ("Search", stats)]
     if location.crs is not None:
-        rows.append(("CRS", f"<code>{html.escape(location.crs)}</code>"))
+        rows.append(("CRS", f"<code>{in_html(location.crs)}</code>"))
     if location.homography is not None:
         matrix = "\n".join("  ".join(f"{value: .9e}" for value in row) for row in location.homography)
         note = "takes (column, row, 1) to the CRS; the middle of the first pixel is (0.5, 0.5)"
         rows.append(("Homography", f"<pre>{matrix}</pre><small>{note}</small>"))
     if location.command:
-        rows.append(("Made by", f"<code>{html.escape(bare_command(location.command))}</code>"))
+        rows.append(("Made by", f"<code>{in_html(bare_command(location.command))}</code>"))
     return rows
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo._text import in_html
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
@@ -66,7 +66,7 @@ def write_verification(
     """
     name, verdict = bare_name(document["image"]), document["verdict"]
     view = "" if place is None else _draw(document["image"], name, place, corrected, index)
-    rows = [(label, html.escape(value)) for label, value in _numbers(document) if value]
+    rows = [(label, in_html(value)) for label, value in _numbers(document) if value]
     parts = [section("Numbers", label_values(rows) if rows else "")]
     credit = str(document.get("attribution") or "")
     write_text(path, render_page(name, sentence, view, parts, credit, _STATUS[verdict]))

@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 
 from roadgeo._arrays import FloatArray
+from roadgeo._text import in_html
 from roadgeo.outputs.drawing.layers import Box, Layer
 from roadgeo.outputs.drawing.svg import draw_layer, draw_marks, draw_sign
 from roadgeo.outputs.drawing.views import Window
@@ -62,7 +63,7 @@ def draw_viewer(
     if arrows:
         data["data-arrows"] = f"{arrows:.4g}"
         notes = f'<span>residuals, corners <span class="times">enlarged</span></span>{notes}'
-    named = f'<span class="credit">{html.escape(credit)}</span>' if credit else ""
+    named = f'<span class="credit">{in_html(credit)}</span>' if credit else ""
     pad = 0.02 * max(box[2:])
     view = f"{box[0] - pad:.1f} {box[1] - pad:.1f} {box[2] + 2 * pad:.1f} {box[3] + 2 * pad:.1f}"
     given = "".join(f' {name}="{html.escape(value)}"' for name, value in data.items())
@@ -70,14 +71,14 @@ def draw_viewer(
     legend = "".join(
         f'<label><input type="checkbox" data-toggles="{layer.name}"{" checked" if layer.shown else ""}>'
         f'<svg viewBox="0 0 26 14" aria-hidden="true" class="{layer.name}">{draw_sign(layer)}</svg>'
-        f"{html.escape(layer.label)}</label>"
+        f"{in_html(layer.label)}</label>"
         for layer in layers
         if layer.label and draw_marks(layer.marks[:1])
     )
     return (
         '<figure class="viewer"><div class="stage" tabindex="0" role="group" '
         'aria-label="Zoom with + and −, move with the arrow keys, 0 shows all">'
-        f'<svg class="view" viewBox="{view}" role="img" aria-label="{html.escape(text)}"{given}>{groups}{_MARKS}</svg>'
+        f'<svg class="view" viewBox="{view}" role="img" aria-label="{in_html(text)}"{given}>{groups}{_MARKS}</svg>'
         f'{_BUTTONS}<div class="notes">{notes}<span class="position"></span></div>{named}</div>'
         f'<fieldset class="legend" aria-label="Layers">{legend}</fieldset></figure>'
     )
