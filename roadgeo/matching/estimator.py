@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 
@@ -16,14 +17,32 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.events import Events, Ledger
-from roadgeo.matching.growing import SharedSweeps, grow_proposals, screen_proposals
+from roadgeo.matching.growing import (
+    MAX_GROWN,
+    MAX_SCALE_RATIO,
+    MAX_SCREENED,
+    MAX_VERIFIED,
+    SharedSweeps,
+    grow_proposals,
+    screen_proposals,
+)
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
 from roadgeo.matching.scene import AGREE_DEG, Scene
-from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, cut_to_units, larger, n_units
+from roadgeo.matching.triples import (
+    BEFORE_ROADS,
+    WITHOUT_ROADS,
+    Proposals,
+    Sweep,
+    TripleOptions,
+    cut_to_units,
+    larger,
+    n_units,
+    propose,
+)
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
@@ -40,6 +59,9 @@ _HARDLY = 0.5
 _LEADING = 2.0
 #: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
+#: Intersections of a place, those with the rarest tuples first, that are looked up elsewhere on the map before it is
+#: accepted; and how.
+_N_EQUALS, _OWN_TUPLES = 6, TripleOptions()
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis, and comparing a
 #: hypothesis with the map, plus the time for each road point.
@@ -105,6 +127,7 @@ class TripleEstimator:
         self._settled: dict[Place, Place] = {}  # what became of each place that was to be verified
         self._nearby: dict[Place, float] = {}
         self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
+        self._equals_of: list[Place] = []  # whose own tuples were looked for elsewhere
         self._whole: list[Place] = []  # verified, and no better version of them is to be expected
         self.scene = scene
         self.index = index
@@ -260,6 +283,22 @@ class TripleEstimator:
             if not any(place.same(other) for other in (*self._whole, *distinct)):
                 distinct.append(place)
                 yield place
+
+    def look_for_equals(self, place: Place) -> None:
+        """Verify where else on the map a place's own tuples fit, at any turn and scale; once for each place."""
+        if any(other.same(place) for other in self._equals_of):
+            return
+        self._equals_of.append(place)
+        camera, there = self.options.camera, place.matches[0]
+        scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
+        args = self.scene, [self.index], scale, camera.min_shape_ratio, _OWN_TUPLES
+        anchors = propose(*args, self.sweeps.ahead, np.flatnonzero(there >= 0))
+        for (proposals,) in islice(anchors, _N_EQUALS):
+            elsewhere = self.allow(proposals) & (proposals.reference != there[proposals.anchor])
+            kept = self.screen(proposals, elsewhere, MAX_SCREENED)
+            for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
+                if not other.same(place):
+                    self.settle(other)
 
     def settle(self, place: Place) -> tuple[Place, float]:
         """Return a place refined, and its score: its lead over the places that were met, and over those nearby."""

@@ -112,7 +112,7 @@ class Rivals:
         best = max(parts, key=self._explained)
         if max((place.score for place in self.estimators[best].verified), default=-math.inf) < self.needed:
             return None  # a place that was met is already too good a rival
-        place = self._by_roads(best)
+        place = self._among_equals(best)
         if place is None or place.score < 2.0 * self.needed:
             return None
         return None if any(self._rivals(part, place) for part in parts if part is not best) else best
@@ -127,7 +127,7 @@ class Rivals:
 
     def compare(self, part: Search[Place]) -> Place | None:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
-        by_roads, estimator = self._by_roads(part), self.estimators[part]
+        by_roads, estimator = self._among_equals(part), self.estimators[part]
         is_soft = estimator.scene.probability is not None
         may_decide = (is_soft or estimator.is_told) and time.perf_counter() <= self._deadline
         if by_roads is None or by_roads.score >= _CERTAIN or not may_decide:
@@ -177,6 +177,14 @@ class Rivals:
                 break
         score = max(lead - _penalty(best), 0.0) - self._by_chance
         return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
+
+    def _among_equals(self, part: Search[Place]) -> Place | None:
+        """Compare the likeliest place of a part; where it leads, also with what its own tuples fit elsewhere."""
+        place = self._by_roads(part)
+        if place is None or place.score < self.needed:
+            return place
+        self.estimators[part].look_for_equals(place)
+        return self._by_roads(part)
 
     def _by_roads(self, part: Search[Place]) -> Place | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""

@@ -161,15 +161,19 @@ def propose(
     min_ratio: float,
     options: TripleOptions,
     ahead: Ahead = ALONE,
+    among: IntArray | None = None,
 ) -> Iterator[list[Proposals]]:
     """Yield each anchor's proposals on each of the indexes (see `TripleOptions.spread` for the order of anchors).
+
+    Anchors are all intersections of the query, or those `among` (K,).
 
     All indexes together determine the order of anchors and triples and the bounds, as if they were a single index. Each
     gets a share of the bounds that grows with its number of entries to compare.
     """
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
-    weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / _MAX_WEIGHED)))
+    weighed = np.arange(len(query)) if among is None else among
+    weighed = weighed[:: max(1, math.ceil(len(weighed) / _MAX_WEIGHED))]
     # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)

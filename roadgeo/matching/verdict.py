@@ -61,8 +61,8 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
         return _fits_elsewhere(location, [better, *_listed(searched, compared)][:N_PLACES], options)
     best, rivals = (compared[0] if compared else None), compared[1:]
     needed = options.min_log10_odds
-    rival = None if best is None else _equal(best, rivals, needed)
     listed = _listed(searched, compared)
+    rival = None if best is None else _equal(best, rivals, listed, needed)
     if best is None or (best.score < needed and rival is None):
         return _refuse(location, query, searched, listed, options)
     best = _against(best, rivals, needed)
@@ -152,20 +152,28 @@ def _against(best: Place, rivals: Sequence[Place], needed: float) -> Place:
     return best.but(score=min([best.score, *(lead / best.statement_px for lead in leads)]))
 
 
-def _equal(best: Place, rivals: Sequence[Place], needed: float) -> Place | None:
+def _equal(best: Place, rivals: Sequence[Place], listed: Sequence[Place], needed: float) -> Place | None:
     """Return a rival that makes the best place ambiguous, or None.
 
-    If no place would be reported, that is a rival that agrees as well as the best place where streets repeat. Otherwise
-    it is a rival without which the best place would be reported.
+    If no place would be reported, that is a rival that agrees as well as the best place where streets repeat; or one
+    with which it stands out from all others. Otherwise it is a rival without which the best place would be reported.
     """
     if best.score < needed:
-        return next((one for one in rivals if _are_alike(best, one)), None)
+        alike = next((one for one in rivals if _are_alike(best, one)), None)
+        return alike or (rivals[0] if rivals and _stand_out(best, rivals[0], listed[2:], needed) else None)
     return next((one for one in rivals if _against(best, [one], needed).score < needed), None)
 
 
 def _are_alike(best: Place, rival: Place) -> bool:
     """Return whether both places agree so well that only repeating streets explain it, whatever their scores."""
     return min(best.agreeing, rival.agreeing) >= _LIKE_THE_TRUTH
+
+
+def _stand_out(best: Place, rival: Place, others: Sequence[Place], needed: float) -> bool:
+    """Return whether two places of a map explain much, and more than all others by the score needed."""
+    explains = min(best.log10_likelihood, rival.log10_likelihood) >= 2.0 * needed
+    on_one_map = best.index.is_of_map(rival.index) and abs(best.log10_likelihood - rival.log10_likelihood) < needed
+    return explains and on_one_map and all(other.score <= rival.score - needed for other in others)
 
 
 def _only_half(placed: Placement) -> str:

@@ -100,6 +100,7 @@ def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeyp
     """Also where nothing around the best place is looked at."""
     truth, _, evidence = broken
     monkeypatch.setattr(rivals, "similar_places", lambda *_: [])
+    monkeypatch.setattr(TripleEstimator, "look_for_equals", lambda *_: None)
     far = move_about(Homography(truth)(evidence.scene.center), Shift(-550.0, 450.0, 0.0, 1.0, 0.0)) @ truth
     item, estimator = search_of(broken, truth)
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
@@ -276,6 +277,7 @@ def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_
     monkeypatch.setattr(rivals, "_CERTAIN", certain)
     monkeypatch.setattr(rivals, "_REPEATING", 0.0)
     monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[3:]) or [])
+    monkeypatch.setattr(TripleEstimator, "look_for_equals", lambda *_: None)
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
     assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), *farther]

@@ -1,0 +1,75 @@
+"""Places that are equal, on one map: what a place's own tuples fit elsewhere, at any turn and scale, is its rival."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from shapely import affinity
+from worlds.scenes import PLANE, camera, look, random_lines, scene_of
+
+from roadgeo.geometry.homography import Homography
+from roadgeo.location import Seconds
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import search_references
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.parts import Whole
+from roadgeo.matching.place import Place
+from roadgeo.matching.scene import Query
+from roadgeo.matching.verdict import _stand_out, decide
+from roadgeo.roads.network import build_network
+
+TRUTH = camera((800, 800), (900, 900), 1.0, 0.0, 0.0, 25.0)
+
+
+@pytest.fixture(scope="module")
+def twice():
+    """A district, once more 1.2 times as large and turned by 37 degrees, and the middle of the frame there."""
+    lines = random_lines(31, 1600.0)
+    again = [
+        affinity.translate(affinity.rotate(affinity.scale(line, 1.2, 1.2, origin=(0, 0)), 37.0, origin=(0, 0)), 4000.0)
+        for line in lines
+    ]
+    network = build_network(lines + again, PLANE, {"name": "twice"})
+    graph = look(build_network(lines, PLANE, {"name": "once"}), TRUTH, (900, 900))
+    scene = scene_of(graph, (900, 900))
+    x, y = Homography(TRUTH).everywhere(scene.center)
+    turn = np.radians(37.0)
+    there = 1.2 * np.array([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)]) + (4000.0, 0.0)
+    return Query("frame", scene, graph, Seconds()), build_index(network), there
+
+
+def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
+    query, index, there = twice
+    estimator = TripleEstimator(query.scene, index)
+    place, _ = estimator.settle(Place(query.scene, index, TRUTH))
+    estimator.look_for_equals(place)
+    assert any(np.hypot(*(other.center - there)) < 5.0 for other in estimator.verified)
+    assert estimator.n_anchors == 6
+    n_verified = estimator.n_verified
+    estimator.look_for_equals(place)
+    assert estimator.n_verified == n_verified
+
+
+def test_places_that_are_equal_but_for_turn_and_scale_are_ambiguous(twice):
+    query, index, _ = twice
+    options = LocateOptions()
+    location = decide(query, search_references(query, [Whole(index)], options, 60.0), options)
+    assert location.status == "ambiguous"
+
+
+@pytest.mark.parametrize(
+    ("likelihoods", "others", "stand_out"),
+    [
+        ((8.0, 7.5), [], True),
+        ((8.0, 6.5), [], False),  # explains too little
+        ((20.0, 16.8), [-9.0], True),
+        ((20.0, 16.2), [-9.0], False),  # explains less than the best
+        ((20.0, 19.9), [-3.8], True),
+        ((20.0, 19.9), [-3.2], False),  # one of many
+    ],
+)
+def test_two_places_stand_out_that_explain_much_and_alike_and_more_than_all_others(likelihoods, others, stand_out):
+    index = SimpleNamespace(is_of_map=lambda _: True)
+    best, rival = (SimpleNamespace(log10_likelihood=worth, score=-0.1, index=index) for worth in likelihoods)
+    assert _stand_out(best, rival, [SimpleNamespace(score=score) for score in others], 3.5) is stand_out
