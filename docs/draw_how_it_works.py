@@ -84,7 +84,7 @@ def main() -> None:
 
     draw_codes(axes[0, 2], seen_roads, query.xy, query.tangents, triple, middle, index, tangents, hits[true])
     draw_hits(axes[1, 0], index, hits, true)
-    draw_growth(axes[1, 1], scene, index, triple, hits[true], location.evidence, to_map)
+    draw_growth(axes[1, 1], scene, index, triple, hits[true], location.place.matches, to_map)
     draw_location(axes[1, 2], scene, index, seen_roads, location, to_map)
     figure.text(0.995, 0.002, ATTRIBUTION, ha="right", va="bottom", fontsize=9, color=FAINT)
     write(figure, Path(__file__).parent / "how-it-works.png")
@@ -257,7 +257,7 @@ def draw_hits(ax: Axes, index: ReferenceIndex, hits: np.ndarray, true: int) -> N
 
 
 def draw_growth(
-    ax: Axes, scene: Scene, index: ReferenceIndex, triple: np.ndarray, hit: np.ndarray, evidence: object,
+    ax: Axes, scene: Scene, index: ReferenceIndex, triple: np.ndarray, hit: np.ndarray, matches: object,
     to_map: np.ndarray,
 ) -> None:  # fmt: skip
     """Draw the frame as the first 3, 12, 40 and all matches place it."""
@@ -265,7 +265,7 @@ def draw_growth(
     draw_map(ax, index, center, reach, 1.6)
     x, y = index.plane.origin
     first = scene.intersections.xy[triple], index.xy[hit]
-    pairs = evidence.query_xy, evidence.reference_xy - (x, y)
+    pairs = matches.query_xy, matches.reference_xy - (x, y)
     away = np.hypot(*(pairs[0] - scene.intersections.xy[triple].mean(axis=0)).T)
     order = np.argsort(away)
     shades = mpl.colormaps["viridis"](np.linspace(0.85, 0.05, len(STAGES) + 1))

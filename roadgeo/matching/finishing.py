@@ -29,7 +29,7 @@ from roadgeo.matching.refinement import (
 )
 from roadgeo.matching.scene import Scene
 
-__all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
+__all__ = ["measure_corners", "measured", "refine_beside", "with_honest_corners"]
 
 #: If this share of the mask's roads agrees, no cell of the frame was left out; and the part of that share that a fit to
 #: all cells may lose.
@@ -74,13 +74,20 @@ def measure_corners(estimator: TripleEstimator, best: Place) -> Place:
     return _with_corners(best, scene, estimator.refine_options)
 
 
+def measured(estimator: TripleEstimator, place: Place) -> Place:
+    """Return a place as it was fitted, with the covariance of its corners."""
+    return _with_corners(place, estimator.scene, estimator.refine_options)
+
+
 def _moved(place: Place, refined: Refined) -> Place:
     """Return a place by a better fit; it keeps the likelihood by which it was compared."""
     return place.at(refined).but(by=place.by)
 
 
 def _with_corners(place: Place, scene: Scene, options: RefineOptions) -> Place:
-    assert place.refined is not None  # noqa: S101 - what is measured was refined
+    """Return a place with the covariance of its corners; unchanged where it was never refined."""
+    if place.refined is None:
+        return place
     return place.but(refined=with_honest_corners(place.refined, scene, place.index, options))
 
 

@@ -16,7 +16,7 @@ from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Events, Ledger
-from roadgeo.matching.finishing import measure_corners
+from roadgeo.matching.finishing import measure_corners, measured
 from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
@@ -256,7 +256,7 @@ def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], riv
     kept = begun.events.kept
     return replace(
         begun,
-        places=() if best is None or best.refined is None else _listed(estimator, best),
+        places=() if best is None or best.refined is None else _listed(estimator, best, rivals.needed),
         likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]),
         stopped=search.stopped,
         n_tried=estimator.n_screened,
@@ -269,11 +269,12 @@ def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], riv
     )
 
 
-def _listed(estimator: TripleEstimator, best: Place) -> tuple[Place, ...]:
+def _listed(estimator: TripleEstimator, best: Place, needed: float) -> tuple[Place, ...]:
     """Return the likeliest place, its corners measured, and others that were verified; all by one yardstick.
 
     Likelihoods are those by the picture where there is a soft one, so that places on several maps compare by it. Other
-    places score what they explain less than the best, but no more than the best leads.
+    places score what they explain less than the best, but no more than the best leads. Where the best is not `needed`
+    ahead the corners of all are measured.
     """
     counted_px = best.statement_px
     best = measure_corners(estimator, best.but(by=Weight(best.log10_likelihood, counted_px)))
@@ -290,6 +291,8 @@ def _listed(estimator: TripleEstimator, best: Place) -> tuple[Place, ...]:
         behind = 0.0 if estimator.scene.probability is None else rival.log10_likelihood - best.log10_likelihood
         rival = rival.but(score=min(behind, -best.score, 0.0))
     others = [less_than(best, place) for place in others]
+    if best.score < needed:  # the user may take any of them
+        rival, others = rival and measured(estimator, rival), [measured(estimator, place) for place in others]
     return best.but(rival=rival), *others
 
 

@@ -29,7 +29,7 @@ __all__ = ["decide", "georeference", "match_again", "searched_within"]
 
 
 #: Reason if the clock ended a search: the only case in which an answer depends on the machine and its load.
-_CUT_SHORT = "so that another run may tell otherwise"
+_CUT_SHORT = "the result may differ between runs"
 
 #: Mean share of intersections and roads that agree at the true place of a good mask.
 _LIKE_THE_TRUTH = 0.85
@@ -68,7 +68,7 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
     best = _against(best, rivals, needed)
     runner_up = rival or (rivals[0] if rivals else None)
     location = _at(location, [best, *listed[1:]], runner_up, options)
-    cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.spent.stopped == "time" else ""
+    cut = f"; time limit reached, {_CUT_SHORT}" if location.spent.stopped == "time" else ""
     if rival is not None:
         reason = _two_places(best, rival) + cut
         return replace(location, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
@@ -274,7 +274,7 @@ def _why_nothing(
     if nearest.stopped == "time":
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
-        stopped = f"stopped at the time limit of {limit:g} s{tracing}, {_CUT_SHORT}"
+        stopped = f"time limit of {limit:g} s reached{tracing}, {_CUT_SHORT}"
         told = f"{stopped}; of the places tried, {best}{within}; {_how_far(query, nearest, options)}"
         return Reason.TIME_LIMIT, told
     return (

@@ -85,7 +85,7 @@ def _own(name: str, ending: str, writer: str, summary: str, **more: Any) -> Outp
 
 JSON = _own(
     "json", "_location.json", "location_files.write_json",
-    "place, homography, odds; also written, with a reason, where nothing was found", needs_place=False,
+    "place, homography, score; also written, with a reason, where nothing was found", needs_place=False,
 )  # fmt: skip
 FOOTPRINT = _own(
     "footprint", "_footprint.tif", "footprint.write_footprint",

@@ -68,6 +68,60 @@ def test_a_listed_place_is_taken_and_the_result_says_so(porto, refused, n, capfd
     assert found["command"].count("--take") == 1
 
 
+@pytest.fixture
+def answered(porto, monkeypatch, capfd):
+    """An answer lies in the folder; whoever searches from here on fails."""
+    assert main([*LOCATE, "-r", str(porto)]) == 3
+    capfd.readouterr()
+
+    def fail(*_, **__):
+        raise AssertionError("searched again")
+
+    monkeypatch.setattr("roadgeo.workflows.search_references", fail)
+    return json.loads(Path("elsewhere_location.json").read_text())["alternatives"]
+
+
+def test_taking_a_place_of_an_answer_searches_nothing(answered, porto, capfd):
+    assert main([*LOCATE, "-r", str(porto), "--take", "2"]) == 0
+    assert capfd.readouterr().err == ""
+    taken = json.loads(Path("elsewhere_location.json").read_text())
+    assert taken["status"] == "chosen"
+    assert np.allclose(taken["homography"], answered[1]["homography"], rtol=1e-9)
+    assert np.allclose(taken["corner_covariance_m2"], answered[1]["corner_covariance_m2"], rtol=1e-6)
+    assert min(taken["corner_sigma_m"]) > 0.0
+    assert taken["n_matched"] > 0  # matched anew, on the map that is named
+    assert {"elsewhere_footprint.tif", "elsewhere_location.gpkg"} <= {path.name for path in Path().iterdir()}
+
+
+def test_the_listed_place_nearest_to_a_point_is_taken(answered, porto):
+    lon, lat = answered[2]["center"]["lon"], answered[2]["center"]["lat"]
+    assert main([*LOCATE, "-r", str(porto), "--take", f"{lon:.5f},{lat:.5f}"]) == 0
+    taken = json.loads(Path("elsewhere_location.json").read_text())
+    assert taken["center"]["lon"] == pytest.approx(lon, abs=1e-5)
+    assert taken["reason"].startswith("chosen by you: place 3 of ")
+    assert main([*LOCATE, "-r", str(porto), "--take", f"{lon + 1.0:.5f},{lat:.5f}"]) == 1
+
+
+def test_without_an_answer_it_is_searched_first_which_is_said(porto, caplog):
+    assert main([*LOCATE, "-r", str(porto), "--take", "1"]) == 0
+    assert "no earlier answer lies in .: searching first" in caplog.text
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "1.5", "nowhere", "200,10", "1,2,3"])
+def test_what_is_no_place_is_a_usage_error(text, porto, capfd):
+    assert main([*LOCATE, "-r", str(porto), "--take", text]) == 2
+    assert "expected the number of a place, from 1, or LON,LAT near it" in capfd.readouterr().err
+
+
+def test_an_answer_in_python_gives_its_places(refused):
+    taken = refused.take(2)
+    assert (taken.status, len(taken.places)) == ("chosen", len(refused.places))
+    assert taken.center == refused.places[1].center
+    near = refused.take((refused.places[2].center.lon, refused.places[2].center.lat))
+    assert near.center == refused.places[2].center
+    assert taken.write("taken")
+
+
 def test_a_place_that_is_not_listed_cannot_be_taken(porto, refused, capfd):
     assert main([*LOCATE, "-r", str(porto), "--take", "9"]) == 1
     err = capfd.readouterr().err
