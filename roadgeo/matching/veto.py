@@ -16,7 +16,7 @@ from roadgeo.geometry.areas import lies_in
 from roadgeo.geometry.camera import CameraOptions, pose
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.methods import Searched, search_references
+from roadgeo.matching.methods import Searched, may_show, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Part
 from roadgeo.matching.place import Place, Weight
@@ -57,8 +57,8 @@ def contest(
     if not is_told:
         brief = replace(free.search, work_limit_s=min(_BRIEFLY_S, free.search.work_limit_s))
         free = replace(free, effort="quick", search=brief)
-    searched = {one.index for one in told if one.n_searched}
-    here = [part for part in parts if part.open() in searched]
+    frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
+    here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
     found = search_references(query, here, free, time_limit_s)
     others = [place for one in found for place in (one.likeliest if is_told else one.places[:1])]
     if not is_told:

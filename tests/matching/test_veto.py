@@ -121,3 +121,19 @@ def test_without_hints_there_is_nothing_to_contest(town):
     assert veto.without_hints(wider) is None  # all scales, in pixels four times as coarse
     bare = veto.without_hints(told(town, gsd_m=(0.9, 1.1), heading_deg=(0.0, 5.0)))
     assert bare == options
+
+
+def test_no_map_is_opened_for_it_that_the_hints_exclude(town):
+    query, index = town
+
+    class Far(Whole):
+        def may_hold(self, near, frame_m=0.0):
+            return False
+
+        def open(self):
+            raise AssertionError("it was opened")
+
+    options = told(town)
+    searched = [Searched(index, found(town, options), n_searched=len(index))]
+    parts = [Whole(index), Far(index)]
+    assert decide(query, veto.contest(query, searched, parts, options, 60.0), options).located
