@@ -187,8 +187,9 @@ def _locked_folder(parent: Path) -> Iterator[Path]:
         yield folder
     finally:
         lock.close()
-        shutil.rmtree(folder, ignore_errors=True)
-        _own.discard(folder)
+        if folder in _own:
+            shutil.rmtree(folder, ignore_errors=True)
+            _own.discard(folder)
 
 
 def stage(parent: Path) -> Path:

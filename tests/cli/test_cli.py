@@ -39,6 +39,8 @@ def test_no_command_shows_help(group: tuple[str, ...], capfd: pytest.CaptureFixt
     [
         (RoadgeoError("no such\nthing"), 1, "Error: no such thing\n"),
         (KeyboardInterrupt(), 130, "Interrupted.\n"),
+        (MemoryError(), 1, "Error: more memory is needed than there is"),
+        (RuntimeError("std::bad_alloc"), 1, "Error: more memory is needed than there is"),
         (ZeroDivisionError("x"), 1, "Error: ZeroDivisionError: x. This is a fault of roadgeo; "),
     ],
 )

@@ -182,3 +182,19 @@ def test_errors_name_the_file_not_where_it_was_staged(tmp_path: Path) -> None:
     with pytest.raises(OutputError) as raised, replacing(tmp_path / "a.json") as staged:
         raise OutputError(f"cannot write {staged}: no room")
     assert str(raised.value) == f"cannot write {tmp_path / 'a.json'}: no room"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_a_process_that_is_forked_off_removes_nothing_of_its_parents(tmp_path: Path) -> None:
+    program = """
+import os, sys
+from pathlib import Path
+from roadgeo.storage.files import replacing
+with replacing(Path(sys.argv[1])) as staged:
+    staged.write_text("whole")
+    if not os.fork():
+        sys.exit()
+    os.wait()
+"""
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.txt")], check=True)
+    assert (tmp_path / "a.txt").read_text() == "whole"
