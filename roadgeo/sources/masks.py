@@ -163,8 +163,11 @@ def open_mask(
         _require_mask(raster)
         if choice.road_class is not None:
             raster = _of_class(raster, choice.road_class)
-        raster = _of_colours(_without_fill(raster))
         seen, hidden = _sample(raster)
+        plain = _of_colours(_without_fill(raster, seen))
+        if plain is not raster:
+            raster = plain
+            seen, hidden = _sample(raster)
         if len(hidden):
             raster = _drawn(raster, seen, hidden)
             seen, _ = _sample(raster)
@@ -252,9 +255,11 @@ def _of_class(raster: Raster, number: int) -> Raster:
     return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
 
 
-def _without_fill(raster: Raster) -> Raster:
-    """Leave out pixels of a value that lies far from all others, and does not look like roads: nodata by no name."""
-    seen, _ = _sample(raster)
+def _without_fill(raster: Raster, seen: AnyArray) -> Raster:
+    """Leave out pixels of a value that lies far from all others, and does not look like roads: nodata by no name.
+
+    (n, B) values of a sample were observed.
+    """
     for end in () if len(seen) == 0 else (seen.min(), seen.max()):
         is_fill = (seen == end).all(axis=1)
         others = seen[~is_fill].astype(np.float64)
