@@ -292,9 +292,9 @@ def _what_may_help(query: Query, listed: Sequence[Place], options: LocateOptions
     away = [listed[0].apart_m(one) for one in listed]
     place_lacks = options.near is None and options.match.within is None
     hints = (
-        (camera.gsd_m == usual.gsd_m, "the size of a pixel", "5 %", "(--gsd)", scaled, math.log(1.05)),
-        (camera.heading is None, "the heading", "5 degrees", "(--heading)", turned, 5.0),
-        (place_lacks, "the place", "200 m", "(--near)", away, 200.0),
+        (camera.gsd_m == usual.gsd_m, "the size of a pixel", "5 %", "(--gsd SIZE+-5%)", scaled, math.log(1.05)),
+        (camera.heading is None, "the heading", "5 degrees", "(--heading DEG+-5)", turned, 5.0),
+        (place_lacks, "the place", "200 m", "(--near LON,LAT,200)", away, 200.0),
     )
     helps = []
     for lacks, name, precision, option, apart, most in hints:

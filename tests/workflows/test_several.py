@@ -192,17 +192,21 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
 @pytest.mark.parametrize(
     ("near", "camera", "reported"),
     [
-        (None, {}, "; the size of a pixel (--gsd), the heading (--heading), the place (--near), more roads in view or"),
+        (
+            None,
+            {},
+            "; the size of a pixel (--gsd SIZE+-5%), the heading (--heading DEG+-5), the place (--near LON,LAT,200), more",
+        ),
         (
             NEAR,
             {},
-            "; searched within 500 m of -71.06,42.36; the size of a pixel (--gsd), the heading (--heading), more",
+            "; searched within 500 m of -71.06,42.36; the size of a pixel (--gsd SIZE+-5%), the heading (--heading DEG+-5), ",
         ),
         ((8.123456, -1.0, 1234567.0), {}, "; searched within 1200 km of 8.12346,-1; "),
         (
             None,
             {"gsd_m": (0.5, 1.0)},
-            "; searched at 0.5 to 1 m per pixel; the heading (--heading), the place (--near)",
+            "; searched at 0.5 to 1 m per pixel; the heading (--heading DEG+-5), the place (--near LON,LAT,200)",
         ),
         (None, {"max_tilt_deg": 20.0}, "; searched tilted by up to 20 degrees; "),
         (None, {"focal_px": 1280.0}, "; searched with a focal length of 1280 pixels; "),
@@ -228,8 +232,11 @@ def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camer
 def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
     best = judge(query, searched("a", (1.5, 300.0), (0.5, 5000.0)))
     assert (best.status, best.center) == ("not_located", None)
-    assert "the heading to 5 degrees (--heading) would leave 2 of 2 places" in best.reason
-    assert "the place to 200 m (--near) would leave 1 of 2 places, more roads in view or another map" in best.reason
+    assert "the heading to 5 degrees (--heading DEG+-5) would leave 2 of 2 places" in best.reason
+    assert (
+        "the place to 200 m (--near LON,LAT,200) would leave 1 of 2 places, more roads in view or another map"
+        in best.reason
+    )
     assert [alternative.score for alternative in best.alternatives] == [1.5, 0.5]
 
 
