@@ -195,12 +195,12 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
         (
             None,
             {},
-            "; the size of a pixel (--gsd SIZE+-5%), the heading (--heading DEG+-5), the place (--near LON,LAT,200), more",
+            "; the size of a pixel (--gsd SIZE+-5%), the heading (--heading DEG+-5), the place (--near LON,LAT,200)",
         ),
         (
             NEAR,
             {},
-            "; searched within 500 m of -71.06,42.36; the size of a pixel (--gsd SIZE+-5%), the heading (--heading DEG+-5), ",
+            "; searched within 500 m of -71.06,42.36; the size of a pixel (--gsd SIZE+-5%), the heading (--heading",
         ),
         ((8.123456, -1.0, 1234567.0), {}, "; searched within 1200 km of 8.12346,-1; "),
         (
