@@ -202,7 +202,14 @@ def _levels(path: Path, layer: str, areas: bool) -> tuple[str, list[str]]:
         return "", []
     kinds = shapely.get_type_id(shapely.from_wkb(found.shapes, on_invalid="ignore"))
     lines = np.isin(kinds, (1, 2, 5, 7, *((3, 6) if areas else ())))
-    return column, sorted({str(value) for value in found.columns[column.lower()][lines] if value is not None})
+    return column, _names_of(found.columns[column.lower()][lines], path)
+
+
+def _names_of(values: AnyArray, path: Path) -> list[str]:
+    """Return the names of layers in a column; of other files than drawings no numbers: they say what is above what."""
+    named = {str(value) for value in values if value is not None}
+    is_drawing = path.name.lower().endswith(_DRAWINGS)
+    return sorted(name for name in named if is_drawing or not re.fullmatch(r"[-+]?[\d.]+|nan", name))
 
 
 def _is_filled(path: Path, layer: str) -> bool:
@@ -223,7 +230,7 @@ def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
         return total, known, ""
     head = read_layer(path, layer, fields, 0, _PEEK).columns
     column = next((name for name in fields if name.lower() in _LEVELS), "")
-    levels = sorted({value for value in head.get(column.lower(), ()) if isinstance(value, str) and not value.isdigit()})
+    levels = _names_of(head.get(column.lower(), np.empty(0, object)), path)
     hint = f"{column}: {_listed(levels)}" if len(levels) > 1 else ""
     return total, known + [name for name in fields if name not in known and names_kinds(head[name.lower()])], hint
 

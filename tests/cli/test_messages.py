@@ -145,4 +145,4 @@ def test_the_place_that_a_mask_states_is_compared(porto: Path, capfd: pytest.Cap
     place = rasterio.Affine(1, 0, x - width / 2, 0, -1, y + height / 2)
     write_raster("stated.tif", drone(), crs=found["crs"], transform=place)
     assert locate("stated.tif", porto) == 0
-    assert "georeference puts the middle 120." in capfd.readouterr().out
+    assert "puts the middle 120." in capfd.readouterr().out
