@@ -219,8 +219,8 @@ def locate(
     ValueError
         A hint makes no sense; `near` lies on no map, but would with longitude and latitude exchanged.
     """
-    from roadgeo.running.batch import changed_options
     from roadgeo.running.choosing import take_place
+    from roadgeo.running.locating import changed_options
     from roadgeo.running.looks import Sighting
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.pictures import pixels_of, read_picture
@@ -431,7 +431,7 @@ def _hint(name: str, value: Any) -> Any:
 
 def _open(reference: References) -> list[AnyReference]:
     """Open what is not open yet; nothing named: all of the library."""
-    from roadgeo.running.batch import open_references
+    from roadgeo.reference.opening import open_references
 
     given = [reference] if isinstance(reference, Reference | ShardedReference | str | os.PathLike) else list(reference)
     if not given:

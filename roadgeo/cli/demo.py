@@ -15,7 +15,7 @@ from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
     from roadgeo.evaluation.demo import DemoMask
-    from roadgeo.running.batch import Outcome
+    from roadgeo.running.locating import Outcome
 
 __all__ = ["demo_command"]
 

@@ -50,7 +50,8 @@ from roadgeo.outputs.registry import (
     offered,
 )
 from roadgeo.outputs.wording import format_lonlat
-from roadgeo.running.batch import Outcome, locate_masks, write_overview
+from roadgeo.running.batch import locate_masks, write_overview
+from roadgeo.running.locating import Outcome
 from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import SUFFIXES
 from roadgeo.storage.files import make_folder

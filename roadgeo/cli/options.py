@@ -483,8 +483,7 @@ def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = No
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
-    from roadgeo.reference.opening import swapped_near
-    from roadgeo.running.batch import open_references
+    from roadgeo.reference.opening import open_references, swapped_near
 
     references = open_references(names, print_steps())
     meant = None if near is None else swapped_near(near, references)

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import unicodedata
+from collections.abc import Iterable
 from pathlib import Path
 
 from roadgeo.errors import IndexFormatError
@@ -24,6 +25,7 @@ __all__ = [
     "new_reference",
     "remove_reference",
     "resolve_reference",
+    "resolve_references",
     "resolve_whole",
     "shelved_files",
 ]
@@ -156,3 +158,19 @@ def _shelved(name: str) -> ReferencePaths:
     return reference_paths(
         library_dir() / make_slug(name.removesuffix(".gpkg").removesuffix(".index").removesuffix(ENDING))
     )
+
+
+def resolve_references(names: Iterable[str]) -> list[Path]:
+    """Return the files of references by path or name; none named: all of the library.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing, or the library is empty.
+    """
+    paths = [resolve_reference(name) for name in names] or list_references()
+    if not paths:
+        raise IndexFormatError(
+            f"the library in {library_dir()} is empty and no --reference was given; build one with `roadgeo index`"
+        )
+    return paths

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.reference.library import resolve_reference
+from roadgeo.reference.library import resolve_reference, resolve_references
 from roadgeo.reference.reference import Reference, open_whole
 from roadgeo.reference.shards import ShardedReference, manifest_path, open_shards
 
-__all__ = ["AnyReference", "digest_of", "open_reference", "swapped_near"]
+__all__ = ["AnyReference", "digest_of", "open_reference", "open_references", "swapped_near"]
 
 #: One piece, or shards.
 AnyReference: TypeAlias = Reference | ShardedReference
@@ -54,3 +54,14 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
     found = resolve_reference(path)
     manifest = manifest_path(found) if found.is_dir() else None
     return open_whole(found, say) if manifest is None else open_shards(manifest)
+
+
+def open_references(names: Iterable[str], say: Say = say_nothing) -> list[AnyReference]:
+    """Open references by path or name; none named: all of the library. `say` is called if an index has to be built.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing or unusable, or the library is empty.
+    """
+    return [open_reference(path, say) for path in resolve_references(names)]

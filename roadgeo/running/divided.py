@@ -31,9 +31,10 @@ from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.search import Ahead
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verdict import decide
+from roadgeo.reference.opening import open_references
 from roadgeo.reference.shards import ShardedReference
-from roadgeo.running.batch import Locating, Outcome, open_references
 from roadgeo.running.cluster import Cluster, DaskWorkers
+from roadgeo.running.locating import Locating, Outcome
 from roadgeo.running.pool import Lost, Pool
 from roadgeo.running.tasks import Task
 

@@ -63,7 +63,7 @@ class VerifyRun:
     def prepare(self) -> Callable[[Task], Verified]:
         """Open the references."""
         from roadgeo.kernels.warmup import warm_up
-        from roadgeo.running.batch import open_references
+        from roadgeo.reference.opening import open_references
 
         references = open_references(self.references)
         warm_up()

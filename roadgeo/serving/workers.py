@@ -185,7 +185,7 @@ class Serving:
         """Open the references, and load the network."""
         from roadgeo.errors import ModelError
         from roadgeo.kernels.warmup import warm_up
-        from roadgeo.running.batch import open_references
+        from roadgeo.reference.opening import open_references
         from roadgeo.running.photographs import load_model
 
         references = open_references(self.references)

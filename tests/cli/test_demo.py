@@ -8,7 +8,7 @@ from roadgeo.evaluation.demo import DemoMask
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.running.batch import Outcome
+from roadgeo.running.locating import Outcome
 
 
 def located(mask: DemoMask, east_m: float) -> Outcome:

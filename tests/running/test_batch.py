@@ -16,7 +16,7 @@ from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
-from roadgeo.running.batch import Asked, Locating, Outcome
+from roadgeo.running.locating import Asked, Locating, Outcome
 from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import SUFFIXES, VIDEOS, Task, find_masks, name_tasks
 
