@@ -107,7 +107,7 @@ def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:
     for wrong, code in (
         ({"near": (2.35, 48.85, 100.0)}, "few_near"),
         ({"within": "Germany"}, "few_near"),
-        ({"within": (-8.7, 41.0, -8.65, 41.3)}, "time_limit"),
+        ({"within": (-8.7, 41.0, -8.65, 41.3)}, "fits_elsewhere"),
         ({"gsd": (2.0, 3.0), "max_tilt": 5.0, "north_up": True}, "nothing_stands_out"),
     ):
         refused = roadgeo.locate(DRONE, porto, QUICK, **wrong)
