@@ -42,9 +42,9 @@ FLIGHT = "The flight"
 
 _HELP = """Follow a flight over the map, frame by frame.
 
-FRAMES overlap, each with the one before: masks of roads or photographs (files, folders or patterns, in order), or a
-video. One low frame shows too few roads to be located; so frames are laid together until the map knows them, and from
-there on each is followed from the one before. What does not agree with the map is said:
+FRAMES overlap, each with the one before: masks or photographs (files, folders or patterns, in order), or a video. One
+low frame shows too few roads to be located; so frames are laid together until the map knows them, and from there on
+each is followed from the one before:
 
 \b
   located    placed by the search, with those that waited beside it
