@@ -26,6 +26,10 @@ __all__ = ["broken_hints", "contest", "without_hints"]
 
 #: A place at the told one is another place if it is turned by more, or larger or smaller by this factor.
 _TURNED_DEG, _SCALED = 45.0, 1.25
+#: Another place explains more if its log10 likelihood is greater by this: where streets repeat places are equal but for
+#: the accuracy of tracing, and a hint is what tells them apart. In a trial on 98 told masks and photographs right places
+#: led by 0.3 and more, and 18 of 19 wrong ones were led by 1.5 and more.
+_MORE = 0.5
 #: Limit of work for a search without hints where the told one found nothing that would be reported, seconds.
 _BRIEFLY_S = 1.0
 
@@ -81,7 +85,7 @@ def _better(told: Place | None, others: Sequence[Place]) -> Place | None:
     ]
     worth, best = max(weighed, key=lambda pair: pair[0], default=(-math.inf, None))
     own = told.agreement.log10_likelihood
-    if best is None or worth <= own:
+    if best is None or worth < own + _MORE:
         return None
     return best.but(score=worth - own, by=Weight(worth, told.but(by=None).statement_px))
 

@@ -105,6 +105,17 @@ def test_another_place_lies_elsewhere_is_turned_or_is_of_another_size(town, turn
     assert veto._is_other(Place(query.scene, index, TRUTH), Place(query.scene, index, moved)) is is_other
 
 
+@pytest.mark.parametrize(("more", "is_better"), [(0.3, False), (0.7, True)])
+def test_a_place_that_explains_hardly_more_is_no_better_one(town, monkeypatch, more, is_better):
+    """Where streets repeat a hint is what tells equal places apart."""
+    query, index = town
+    here = Place(query.scene, index, TRUTH)
+    there = Place(query.scene, index, shifted(TRUTH, 300.0, 0.0))
+    own = here.agreement.log10_likelihood
+    monkeypatch.setattr(veto.Evidence, "weigh", lambda *_: own + more)
+    assert (veto._better(here, [there]) is not None) is is_better
+
+
 def test_each_hint_that_a_place_breaks_is_named(town):
     query, index = town
     options = told(town, 500.0, gsd_m=(2.0, 3.0), heading_deg=(90.0, 5.0))
