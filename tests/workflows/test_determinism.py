@@ -25,7 +25,8 @@ def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int 
     """Locate masks in a process of its own; return all that is told of each, but for seconds and the command."""
     names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONHASHSEED": str(threads)}
-    command = ["locate", *map(str, masks), "-r", str(porto), "-o", str(out), "--json", "-q", "--effort", "quick", *more]
+    more = more if "--effort" in more else ("--effort", "quick", *more)
+    command = ["locate", *map(str, masks), "-r", str(porto), "-o", str(out), "--json", "-q", *more]
     done = subprocess.run(
         [sys.executable, "-c", CODE, str(threads), *command],
         env=environment,
