@@ -72,6 +72,8 @@ def fence_of(command: str, given: Mapping[str, Any], allowed: Iterable[str]) -> 
         (write if given.get("shards") is not None else results).append(_target(out, given))
     if given.get("in_place"):
         write += _named({"images": given["images"]})
+    kept = [path for folder in results for path in Path(folder).glob("*_mask.tif") if not path.is_symlink()]
+    read += map(str, kept)  # of photographs, which are made anew
     return Fence(tuple(read), tuple(dict.fromkeys(results)), tuple(write), _reaches(given, bool(plugins)))
 
 

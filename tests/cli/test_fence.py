@@ -12,6 +12,7 @@ import rasterio
 from worlds.demo import DRONE
 from worlds.hostile import MAPS, MASKS, naming, virtual
 
+from roadgeo.cli.fencing import fence_of
 from roadgeo.storage.fence import abi_version
 from roadgeo.storage.folders import cache_dir
 from roadgeo.storage.rasters import raster_size
@@ -132,3 +133,12 @@ def test_images_are_corrected_where_they_lie(porto: Path, tmp_path: Path) -> Non
     done = roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "--in-place", "-o", "said")
     assert done.returncode == 4, done.stderr
     assert roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "-o", "said").returncode == 0
+
+
+def test_a_photographs_mask_of_an_earlier_run_may_be_looked_at(tmp_path: Path) -> None:
+    """It is made anew only if it is ours."""
+    (tmp_path / "photo_mask.tif").touch()
+    (tmp_path / "other_mask.tif").symlink_to("/etc/passwd")
+    read = fence_of("locate", {"images": ["photo.jpg"], "out_dir": str(tmp_path)}, ()).read
+    assert str(tmp_path / "photo_mask.tif") in read
+    assert str(tmp_path / "other_mask.tif") not in read
