@@ -26,9 +26,8 @@ __all__ = ["broken_hints", "contest", "without_hints"]
 
 #: A place at the told one is another place if it is turned by more, or larger or smaller by this factor.
 _TURNED_DEG, _SCALED = 45.0, 1.25
-#: Another place explains more if its log10 likelihood is greater by this: where streets repeat places are equal but for
-#: the accuracy of tracing, and a hint is what tells them apart. In a trial on 98 told masks and photographs right ones
-#: led by 0.3 and more, and 18 of 19 wrong ones were led by 1.5 and more.
+#: Another place explains more if its log10 likelihood is greater by this. Where streets repeat, places are equal but
+#: for the accuracy of tracing, and a hint is what tells them apart: a true one must not lose to the roads' noise.
 _MORE = 0.5
 #: Limit of work for a search without hints where the told one found nothing that would be reported, seconds.
 _BRIEFLY_S = 1.0
