@@ -182,8 +182,8 @@ def test_photographs_go_with_their_masks(
 def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     mask = str(MASKS["map_sheet"].path)
     reference = ["-r", str(porto), "-q"]
-    told = ["--north-up", "--gsd", "0.8:1.2", "--near=-8.629,41.1625,500", "--within", "Portugal"]
-    assert main(["locate", mask, *reference, *told]) == 0
+    hints = ["--north-up", "--gsd", "0.8:1.2", "--near=-8.629,41.1625,500", "--within", "Portugal"]
+    assert main(["locate", mask, *reference, *hints]) == 0
     assert main(["locate", mask, *reference, "--gsd", "2:3"]) == 3
     assert capfd.readouterr().out == ""
     for limits, reported in [

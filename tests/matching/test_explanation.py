@@ -262,27 +262,27 @@ def truth_told(mask, town, options, lonlat):
 
 
 def test_the_true_place_of_a_located_mask_is_not_lost(town, mask):
-    told, _ = truth_told(mask, town, LocateOptions(), lonlat_of(town, TRUTH))
-    assert told["lost_at"] is None
-    assert told["counts"]["proposals"] >= told["counts"]["on_roads"] >= 1
-    assert told["log10_odds"] > 8
+    row, _ = truth_told(mask, town, LocateOptions(), lonlat_of(town, TRUTH))
+    assert row["lost_at"] is None
+    assert row["counts"]["proposals"] >= row["counts"]["on_roads"] >= 1
+    assert row["log10_odds"] > 8
 
 
 @pytest.mark.slow
 def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, mask):
     other = mask_of(random_network(9))
-    told, explanation = truth_told(other, town, LocateOptions(effort="quick"), lonlat_of(town, TRUTH, 90_000.0))
-    assert told["lost_at"] == "map"
-    assert told["said"] in explanation.nearest.missing
+    row, explanation = truth_told(other, town, LocateOptions(effort="quick"), lonlat_of(town, TRUTH, 90_000.0))
+    assert row["lost_at"] == "map"
+    assert row["said"] in explanation.nearest.missing
     far = lonlat_of(town, TRUTH, 900.0)
     assert truth_told(mask, town, LocateOptions(), far)[0]["lost_at"] in {"proposals", "on_roads", "survived"}
 
 
 @pytest.mark.slow
 def test_a_camera_that_refuses_the_true_place_is_named(town, mask):
-    told, _ = truth_told(mask, town, with_camera(gsd_m=(1.4, 5.0)), lonlat_of(town, TRUTH))
-    assert told["lost_at"] == "camera"
-    assert "ground sampling" in told["said"]
+    row, _ = truth_told(mask, town, with_camera(gsd_m=(1.4, 5.0)), lonlat_of(town, TRUTH))
+    assert row["lost_at"] == "camera"
+    assert "ground sampling" in row["said"]
 
 
 def test_a_truth_of_another_mask_is_left_alone(town, mask):

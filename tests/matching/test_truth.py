@@ -33,7 +33,7 @@ def lonlat(x, y):
     return tuple(to_lonlat(PLANE.crs, PLANE.to_crs(np.array([[x, y]])))[0])
 
 
-def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
+def story_of(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
     faults = [CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else []
     return _TruePlace(estimator, lonlat(*at)).story(dict(Counter(met)), faults, best, answer, 3.0)
 
@@ -50,7 +50,7 @@ def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
     ],
 )
 def test_the_first_stage_that_it_did_not_come_out_of(estimator, met, lost_at, said):
-    story = told(estimator, met)
+    story = story_of(estimator, met)
     assert story.lost_at == lost_at
     assert said in story.said
     assert story.log10_odds is None
@@ -73,13 +73,13 @@ def place(x, y):
     ],
 )
 def test_what_was_measured_is_weighed(estimator, best, answer, lost_at, said):
-    story = told(estimator, ["verified"], best, answer=answer)
+    story = story_of(estimator, ["verified"], best, answer=answer)
     assert (story.lost_at, story.log10_odds) == (lost_at, best)
     assert said in story.said
 
 
 def test_off_the_map_nothing_else_counts(estimator):
-    story = told(estimator, ["proposals"], at=(90_000.0, 500.0))
+    story = story_of(estimator, ["proposals"], at=(90_000.0, 500.0))
     assert (story.lost_at, story.said) == ("map", "the true place lies off the map that was searched")
 
 

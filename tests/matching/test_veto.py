@@ -33,7 +33,7 @@ def town():
     return Query("frame", scene, graph, Seconds()), index
 
 
-def told(town, east_m=0.0, radius_m=60.0, **camera):
+def hinted(town, east_m=0.0, radius_m=60.0, **camera):
     """Options with a circle so far east of the truth."""
     query, index = town
     middle = Homography(TRUTH).everywhere(query.scene.center) + np.array([east_m, 0.0])
@@ -57,13 +57,13 @@ def found(town, options):
 
 
 def test_a_place_that_is_told_truly_stands(town):
-    options = told(town)
+    options = hinted(town)
     assert answer(town, options, found(town, options)).located
 
 
 def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_roads_fit_better(town):
     query, index = town
-    options = told(town, 300.0, gsd_m=(0.95, 1.05))
+    options = hinted(town, 300.0, gsd_m=(0.95, 1.05))
     (best, *_) = found(town, options)
     wrong = best.but(matrix=shifted(best.matrix, 300.0, 0.0), score=9.0, rival=None)
     wrong = replace(Place(query.scene, index, wrong.matrix), refined=best.refined, score=9.0)
@@ -75,12 +75,12 @@ def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_
 
 
 def test_a_place_that_agrees_with_the_hints_and_that_they_led_past_is_the_answer(town):
-    options = told(town)
+    options = hinted(town)
     assert answer(town, options, []).located
 
 
 def test_where_hints_lead_to_nothing_only_a_place_that_would_be_reported_is_named(town):
-    options = told(town, 700.0)
+    options = hinted(town, 700.0)
     assert answer(town, options, []).reason_code is Reason.FITS_ELSEWHERE
     strict = replace(options, min_log10_odds=1e6)
     assert answer(town, strict, []).reason_code is Reason.NOTHING_STANDS_OUT
@@ -118,11 +118,11 @@ def test_a_place_that_explains_hardly_more_is_no_better_one(town, monkeypatch, m
 
 def test_each_hint_that_a_place_breaks_is_named(town):
     query, index = town
-    options = told(town, 500.0, gsd_m=(2.0, 3.0), heading_deg=(90.0, 5.0))
+    options = hinted(town, 500.0, gsd_m=(2.0, 3.0), heading_deg=(90.0, 5.0))
     options = replace(options, match=replace(options.match, within=(10.0, 10.0, 11.0, 11.0)))
     ways = veto.broken_hints(Place(query.scene, index, TRUTH), options)
     assert [way.split(": leave ")[1] for way in ways] == ["--near out", "--within out", "--gsd out", "--heading out"]
-    assert veto.broken_hints(Place(query.scene, index, TRUTH), told(town)) == []
+    assert veto.broken_hints(Place(query.scene, index, TRUTH), hinted(town)) == []
 
 
 def test_without_hints_there_is_nothing_to_contest(town):
@@ -130,7 +130,7 @@ def test_without_hints_there_is_nothing_to_contest(town):
     assert veto.without_hints(options) is None
     wider = replace(options, match=replace(options.match, camera=CameraOptions(gsd_m=(0.4, 48.0))))
     assert veto.without_hints(wider) is None  # all scales, in pixels four times as coarse
-    bare = veto.without_hints(told(town, gsd_m=(0.9, 1.1), heading_deg=(0.0, 5.0)))
+    bare = veto.without_hints(hinted(town, gsd_m=(0.9, 1.1), heading_deg=(0.0, 5.0)))
     assert bare == options
 
 
@@ -144,7 +144,7 @@ def test_no_map_is_opened_for_it_that_the_hints_exclude(town):
         def open(self):
             raise AssertionError("it was opened")
 
-    options = told(town)
+    options = hinted(town)
     searched = [Searched(index, found(town, options), n_searched=len(index))]
     parts = [Whole(index), Far(index)]
     assert decide(query, veto.contest(query, searched, parts, options, 60.0), options).located

@@ -160,14 +160,14 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "told", "is_the_file"),
+    ("number", "message", "is_the_file"),
     [
         (errno.ENOMEM, "too little memory to open it; end other programs", False),
         (errno.EIO, "input/output error", True),
     ],
 )
 def test_too_little_memory_is_no_fault_of_the_file(
-    path: Path, monkeypatch: pytest.MonkeyPatch, number: int, told: str, is_the_file: bool
+    path: Path, monkeypatch: pytest.MonkeyPatch, number: int, message: str, is_the_file: bool
 ) -> None:
     """It said: build it again."""
 
@@ -175,7 +175,7 @@ def test_too_little_memory_is_no_fault_of_the_file(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(index_file.mmap, "mmap", refuse)
-    with pytest.raises(RoadgeoError, match=told) as raised:
+    with pytest.raises(RoadgeoError, match=message) as raised:
         read_index(path)
     assert isinstance(raised.value, IndexFormatError) == is_the_file
 

@@ -115,9 +115,9 @@ def pool():
 
 
 def test_progress_is_passed_on_and_errors_are_raised(pool: Pool) -> None:
-    told: list[object] = []
-    process = pool.do("tell", say=lambda *said: told.append(said))
-    assert told == [("half", 0.5)]
+    messages: list[object] = []
+    process = pool.do("tell", say=lambda *said: messages.append(said))
+    assert messages == [("half", 0.5)]
     with pytest.raises(RoadgeoError, match="no road"):
         pool.do("fail")
     with pytest.raises(RuntimeError, match="_OddError"):

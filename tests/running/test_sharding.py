@@ -347,13 +347,13 @@ def test_the_command_line_builds_describes_lists_and_removes(roads, tmp_path, mo
 @pytest.mark.parametrize("asked", [["simulate", "-o", "q"], ["evaluate", "-n", "1"], ["index", "--rebuild"]])
 def test_what_needs_one_piece_says_so(sharded, asked, capsys):
     assert main([*asked, str(sharded.path)]) == 1
-    told = capsys.readouterr().err
-    assert "is in shards, one piece is needed; name one of them, such as" in told
-    assert told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert "is in shards, one piece is needed; name one of them, such as" in message
+    assert message.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         (["--shards", "many", "--roads", "x"], "expected auto, a number, or a side"),
         (["--shards", "4", "--osm", "Boston"], "--shards goes with --roads"),
@@ -361,9 +361,9 @@ def test_what_needs_one_piece_says_so(sharded, asked, capsys):
         (["--shards", "4", "--roads", "x", "--coarse"], "--shards makes a coarse map beside the shards"),
     ],
 )
-def test_what_cannot_be_asked_is_a_usage_error(given, told, capsys):
+def test_what_cannot_be_asked_is_a_usage_error(given, message, capsys):
     assert main(["index", *given]) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_search_lets_go_of_the_roads_that_masks_before_it_led_to(sharded, monkeypatch):

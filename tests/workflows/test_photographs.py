@@ -35,7 +35,7 @@ def maps(data_dir: Path, rows: list[dict[str, str]], tmp_path_factory: pytest.Te
     return {file: roadgeo.index(data_dir / file, path=folder / f"{Path(file).stem}.gpkg") for file in files}
 
 
-def told(row: dict[str, str], what: str) -> LocateOptions:
+def hinted(row: dict[str, str], what: str) -> LocateOptions:
     """What is told of a photograph. No clock: a busy machine changes nothing."""
     options, gsd = LocateOptions(), float(row["gsd_m"])
     camera = options.match.camera
@@ -63,7 +63,7 @@ def test_told_is_no_worse_than_blind(data_dir: Path, rows: list[dict[str, str]],
     for what in found:
         for row in rows:
             path, query = str(data_dir / "photographs" / row["file"]), ReadOptions()
-            location = locate_query(path, [maps[row["roads"]]], told(row, what), query).location
+            location = locate_query(path, [maps[row["roads"]]], hinted(row, what), query).location
             if location.located:
                 assert is_right(location, row), (what, row["file"])
                 found[what][row["file"]] = location.log10_odds or 0.0
