@@ -41,7 +41,9 @@ _MAX_DEPTH = 2.3  # ninth decile of the depth of light pixels, of its mean: 1.8 
 
 #: Neighbours in a faint map differ by one level, in a map of classes by any number of them.
 _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
-_ALIKE = 0.9  # share of neighbours of one number, in a mask of numbered roads
+#: Shares of neighbours of one number in a mask of numbered roads: of all, and without those of the commonest number.
+#: Smooth edges of a plain mask are a pixel wide: they have at most two neighbours in three of their value.
+_ALIKE, _OTHERS_ALIKE = 0.9, 0.8
 #: Share of neighbours that differ in a photograph, and their usual difference, of the span.
 _RESTLESS, _SMOOTH = 0.3, 0.15
 _MANY_LEVELS = 8  # more classes than this do not look like roads
@@ -172,10 +174,15 @@ def find_numbered(sample: Sample) -> float | None:
 
 def are_patches(values: AnyArray, shown: BoolArray) -> bool:
     """Whether neighbours among the (rows, columns) shown mostly have one value, of several whole ones."""
+    if not shown.any() or np.any(values[shown] % 1):
+        return False
+    levels, counts = np.unique(values[shown], return_counts=True)
+    common = values == levels[np.argmax(counts)]
     pairs = shown[:, 1:] & shown[:, :-1], shown[1:] & shown[:-1]
-    same = (values[:, 1:] == values[:, :-1])[pairs[0]], (values[1:] == values[:-1])[pairs[1]]
-    equal = np.concatenate(same)
-    return bool(len(equal) and equal.mean() > _ALIKE and not np.any(values[shown] % 1))
+    equal = np.concatenate([(values[:, 1:] == values[:, :-1])[pairs[0]], (values[1:] == values[:-1])[pairs[1]]])
+    both = np.concatenate([(common[:, 1:] & common[:, :-1])[pairs[0]], (common[1:] & common[:-1])[pairs[1]]])
+    others = equal[~both]
+    return bool(len(equal) and equal.mean() > _ALIKE and (len(others) == 0 or others.mean() > _OTHERS_ALIKE))
 
 
 def ground_and_road(sample: Sample, threshold: float) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as arrays
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
-from roadgeo.roads.thresholds import Sample, find_thresholds
+from roadgeo.roads.thresholds import Sample, find_numbered, find_thresholds
 
 KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
 
@@ -34,3 +34,17 @@ def test_values_that_differ_by_rounding_are_refused() -> None:
     rows: AnyArray = np.resize(1e16 + np.arange(3) * 2.0, (12, 12))
     with pytest.raises(MaskError, match=r"it: 3 values from 1e\+16 to 1e\+16, too alike to part; give a threshold"):
         find_thresholds(Sample("it", rows.reshape(-1, 1), 0, lambda: rows))
+
+
+@pytest.mark.parametrize("width", [3, 6, 10, 16, 30])
+@pytest.mark.parametrize("size", [2, 4])
+def test_smooth_edges_are_no_numbers_of_roads(width: int, size: int) -> None:
+    y, x = np.mgrid[: 400 * size, : 400 * size] / size
+    lines = [abs(x + slope * y - at) for slope, at in ((0.1, 90), (-0.2, 300))]
+    lines += [abs(y + slope * x - at) for slope, at in ((0.05, 120), (-0.1, 260))]
+    fine = np.minimum.reduce(lines) < width / 2
+    rows = np.round(255 * fine.reshape(400, size, 400, size).mean((1, 3))).astype(np.uint8)
+    sample = Sample("it", rows.reshape(-1, 1), 0, lambda: rows)
+    assert len(sample.levels) > 2
+    assert find_numbered(sample) is None
+    assert find_thresholds(sample)[0] == 127.0
