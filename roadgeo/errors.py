@@ -1,4 +1,4 @@
-"""Errors, named by what failed, and the codes of reasons.
+"""Errors, named by the part that failed, and the codes of reasons.
 
 A message holds what was wrong, what was got, what was expected and what to do, on one line. A mask that merely is not
 found on the map is no error: it is a `Location` with a reason.
@@ -82,7 +82,7 @@ class Reason(StrEnum):
 
 
 class RoadgeoError(Exception):
-    """Base of every error that roadgeo raises on purpose; `code` says for programs what it means of an image."""
+    """Base of every error that roadgeo raises on purpose; `code` gives programs its meaning for an image."""
 
     code: ClassVar[Reason] = Reason.INVALID
 
@@ -150,7 +150,7 @@ _NO_MEMORY = re.compile(
 
 
 def is_of_memory(error: BaseException) -> bool:
-    """Whether an error, of whatever library, says that there is no memory left."""
+    """Whether an error, of whatever library, states that there is no memory left."""
     return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
 
 

@@ -87,7 +87,7 @@ class Stats:
 
 @dataclass(frozen=True)
 class Spent:
-    """What an answer cost.
+    """The cost of an answer.
 
     Attributes
     ----------
@@ -103,12 +103,12 @@ class Spent:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What an image shows. Dimension: N intersections.
+    """The content of an image. Dimension: N intersections.
 
     Attributes
     ----------
     size : (width, height)
-        Of the image, pixels.
+        Size of the image, pixels.
     graph : RoadGraph or None
         Its roads in the query plane, pixels (see `geometry.mask`); None where they are not at hand.
     xy : (N, 2) float64
@@ -140,7 +140,7 @@ class Location:
     reason : str
         A sentence; `reason_code` is the same for programs.
     places : tuple of Placement
-        The best first: the answer's own place, and others. Of a refusal, those that were refused.
+        The best first: the answer's own place, and others. In a refusal, the places that were refused.
     reference, attribution : str
         The map that it lies on, or all that were searched in vain, and whom their licences ask to name.
     reference_digest : str
@@ -253,7 +253,7 @@ class Location:
 
     @property
     def fitted(self) -> str | None:
-        """What the roads are consistent with: "similarity" or "homography"."""
+        """The mapping that the roads are consistent with: "similarity" or "homography"."""
         return None if self.place is None else self.place.fitted
 
     @property

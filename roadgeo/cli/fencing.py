@@ -1,4 +1,4 @@
-"""What a command may open, told from what was typed: it is fenced in before it reads anything (`storage.fence`)."""
+"""The files that a command may open, by its arguments: it is fenced in before it reads anything (`storage.fence`)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from roadgeo.storage.gdal import allowed_drivers
 
 __all__ = ["OWN_PROCESS", "enter_fence", "fence_of", "reference_files"]
 
-#: What click's contexts hold where this process runs a command, and nothing besides.
+#: The object that click's contexts hold where this process runs a command, and nothing besides.
 OWN_PROCESS = "own process"
 
 #: Parameters that name references; folders for results; and files or folders of which something may be made.
 _REFERENCES, _RESULTS = ("references", "reference", "rebuild"), ("out_dir", "out")
-#: Commands that go on from what they wrote before: their folder is theirs.
+#: Commands that go on from their earlier results: their folder is theirs.
 _GOES_ON = ("evaluate", "simulate")
 #: Parameters that name plugins, and those for which a network is reached.
 _PLUGINS, _REACHING = ("plugin", "segmenters", "products"), ("place", "around", "polygon", "mavlink", "scheduler")
@@ -27,7 +27,7 @@ _SHARED_MEMORY = "/dev/shm"  # noqa: S108
 
 
 def enter_fence(command: str, given: Mapping[str, Any], allowed: Iterable[str]) -> None:
-    """Fence this process in for a command; where the system cannot do that, say so with --verbose.
+    """Fence this process in for a command; where the system cannot do that, print a line with --verbose.
 
     Parameters
     ----------

@@ -53,11 +53,12 @@ _DIRECTIONS = 12
 CLEAR_M = 40.0
 
 #: Places are marked as located where, of the trials at places that promise as much or more, surely (at the lower end of
-#: the interval of so many standard errors) this share was located; and where they promise this probability themselves.
+#: the interval of this number of standard errors) this share was located; and where they promise this probability
+#: themselves.
 _LOCATED_SHARE, _Z, _MIN_PROBABILITY = 0.95, 1.5, 0.95
 #: Places with fewer intersections around them hold too few, whatever the trials were: `locate` refuses such masks.
 _MIN_INTERSECTIONS = 6
-#: Cells along the side of a window; they are larger where the map would have more than so many along a side.
+#: Cells along the side of a window; they are larger where the map would have more than this number along a side.
 _CELLS_PER_WINDOW, _MAX_CELLS = 10.0, 2000
 
 _LONGER_PX = 1400  # side of the picture

@@ -99,7 +99,7 @@ def _outcome(entry: Score) -> str:
 
 
 def masks_to_csv(evaluation: Evaluation) -> str:
-    """Return a table of all masks: what each is, how it fared, and why."""
+    """Return a table of all masks: their properties, how each fared, and why."""
     names = list(dict.fromkeys(name for entry in evaluation.scores for name in entry.properties))
     own = ["file", "kind", "on_map", "status", "outcome", "center_m", "corners_rms_m", "log10_odds", "compute_s"]
     rows: list[list[object]] = [[*own, "reason", *names]]

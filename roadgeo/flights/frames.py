@@ -43,7 +43,7 @@ _LOG = logging.getLogger(__name__)
 
 #: Frames a second of a video that states none, or none that makes sense.
 _USUAL_RATE = 25.0
-_LONG_S = 3600.0  # no flight is filmed with so long a gap: another clock begins
+_LONG_S = 3600.0  # no flight is filmed with a gap of this length: another clock begins
 _HEAD_BYTES = 4096
 
 
@@ -261,7 +261,7 @@ def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 
 
 
 def _aspect_of(video: cv2.VideoCapture, name: str) -> float:
-    """Return how many times the pixels of a video are as wide as high, as its container says."""
+    """Return how many times the pixels of a video are as wide as high, as its container states."""
     aspect = stretch_of(video.get(cv2.CAP_PROP_SAR_NUM), video.get(cv2.CAP_PROP_SAR_DEN)) or 1.0
     if video.get(cv2.CAP_PROP_ORIENTATION_AUTO) and video.get(cv2.CAP_PROP_ORIENTATION_META) % 180:
         aspect = 1.0 / aspect  # OpenCV has turned the frames
@@ -347,7 +347,7 @@ def _motion(
     """Return how a frame moved against the one before, and how far off that may put a corner, pixels."""
     if options.motion is not None:
         found = options.motion.get(image.name, options.motion.get(Path(image.name).stem))
-        square = np.diag([*image.stretch, 1.0])  # what the user knows of pixels as they are stored
+        square = np.diag([*image.stretch, 1.0])  # the user knows the motion of pixels as they are stored
         return None if found is None else square @ found @ np.linalg.inv(square), 1.5
     if last.mask is None or last.mask.shape != mask.shape:
         last.odometer = Odometer()  # another camera: the previous motion does not apply

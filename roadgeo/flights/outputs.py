@@ -126,7 +126,7 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _runs(rows: Sequence[Row], least: int) -> list[list[Row]]:
-    """Return runs of frames that have places, of at least so many."""
+    """Return runs of frames that have places, of at least this number."""
     runs = [list(run) for is_placed, run in groupby(rows, lambda row: row.center is not None) if is_placed]
     return [run for run in runs if len(run) >= least]
 

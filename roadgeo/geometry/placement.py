@@ -22,7 +22,7 @@ from roadgeo.geometry.uncertainty import CenterError, corner_sigmas
 
 __all__ = ["Camera", "Center", "Matches", "Placement"]
 
-#: A camera's pixels are square to this share; what is stretched more has no camera that saw it.
+#: A camera's pixels are square to this share; no camera saw an image that is stretched more.
 _SQUARE = 0.02
 
 
@@ -129,7 +129,7 @@ class Placement:
     Attributes
     ----------
     size : (width, height)
-        Of the image, pixels.
+        Size of the image, pixels.
     plane : LocalPlane
         The CRS, and an origin near the place.
     matrix : (3, 3) float64
@@ -149,7 +149,7 @@ class Placement:
     is_pinhole : bool
         A camera can have seen it: pixels are square, and nothing is mirrored.
     ground_m : (float, float) or None
-        Mean height of the ground in the frame, and its standard deviation, where a terrain model tells them.
+        Mean height of the ground in the frame, and its standard deviation, where a terrain model gives them.
     matches : Matches or None
         None where they are not known.
     rival : Placement or None
@@ -258,7 +258,7 @@ class Placement:
         Parameters
         ----------
         size : (width, height)
-            Of the other image.
+            Size of the other image.
         matrix : (3, 3) float64
             Affine map from its pixels to this image's.
         """

@@ -4,7 +4,7 @@ Four points determine a homography, so the corners of a frame and their covarian
 A pinhole with square pixels whose axis meets the middle of the frame, above level ground, has six unknowns, or seven
 with its focal length. They are fitted to the corners by least squares, each corner weighed as its errors demand.
 
-Looking straight down, focal length and height cannot be told apart: a lens half as long at half the height sees the
+Looking straight down, focal length and height cannot be separated: a lens half as long at half the height sees the
 same. So an unknown focal length has a prior from usual lenses; where the homography does not determine it, it keeps
 the prior's width, and so does the height. The parameters are chosen so that a focal length that is hardly determined
 changes without the others: where the axis meets the ground, metres per pixel there, and tilt per focal length. With

@@ -112,7 +112,7 @@ def draw_explanation(subject: Subject) -> AnyArray:
 def _draw_seen(subject: Subject, explanation: Explanation) -> list[AnyArray]:
     """Draw the mask, its traced roads and its intersections, and a line of numbers."""
     scene = explanation.scene
-    content = subject.location.content  # in the mask's own pixels, which may not be those of the search
+    content = subject.location.content  # in the mask's own pixels, which the search may not have used
     graph, xy = explanation.graph, scene.intersections.xy
     graph, xy = (graph, xy) if content is None or content.graph is None else (content.graph, content.xy)
     roads = Lines([plane_to_pixel(road) for road in graph.polylines()])

@@ -43,7 +43,7 @@ def read_location(path: str | os.PathLike[str]) -> Location:
 
 
 def read_answer(path: str | os.PathLike[str]) -> Location:
-    """Read all places in a `*_location.json`, refused ones too, as far as it tells what it takes to put an image there.
+    """Read all places in a `*_location.json`, refused ones too, as far as it holds the values that put an image there.
 
     Raises
     ------

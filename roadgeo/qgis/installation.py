@@ -90,7 +90,7 @@ def _make_wheel() -> dict[str, bytes]:
     distribution = metadata.distribution("roadgeo")
     stem, root = f"roadgeo-{distribution.version}", Path(roadgeo.__file__).parent
     files = {f"roadgeo/{file.as_posix()}": content for file, content in _read_folder(root).items()}
-    described = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")  # that of a checkout
+    described = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")  # PKG-INFO is a checkout's
     for name, text in (("METADATA", described), ("entry_points.txt", distribution.read_text("entry_points.txt"))):
         files[f"{stem}.dist-info/{name}"] = (text or "").encode()
     files[f"{stem}.dist-info/WHEEL"] = (

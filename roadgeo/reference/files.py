@@ -51,7 +51,7 @@ __all__ = [
 #: Content of an index file: plain values, and arrays by name.
 IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
 
-#: What distinguishes each file of a reference from one that takes its place; None for a missing file.
+#: Numbers that distinguish each file of a reference from one that takes its place; None for a missing file.
 Identities: TypeAlias = list[tuple[int, int] | None]
 
 #: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage

@@ -1,4 +1,4 @@
-"""References of any kind: opened by their path or name, and what is asked of several together."""
+"""References of any kind: opened by their path or name, and the questions to several together."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Look:
     width_px : float
         Width of lines, and diameter of dots, on a screen.
     width_m : float
-        Width on the ground, of what is drawn to scale where that can be seen; 0 for the same width at every scale.
+        Width on the ground, of lines drawn to scale where that can be seen; 0 for the same width at every scale.
     fill : float
         Opacity inside rings.
     dash : str

@@ -157,7 +157,7 @@ def frame_layers(subject: Subject) -> list[Layer]:
 
 
 def _picture_layer(subject: Subject, image: AnyArray, box: Box) -> Layer:
-    """Return the photograph, or the mask, where a box says."""
+    """Return the photograph, or the mask, inside a box."""
     is_photograph = subject.photo is not None
     picture = Picture(image, box, subject.views.picture_bytes, lossless=not is_photograph)
     return Layer("picture", "photograph" if is_photograph else "mask", [picture])

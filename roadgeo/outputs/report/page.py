@@ -98,7 +98,7 @@ def render_report(subject: Subject) -> str:
 def render_page(
     title: str, text: str, view: str, parts: Iterable[str], attribution: str = "", status: tuple[str, str] | None = None
 ) -> str:
-    """Put a view and what stands beside it (HTML) into a page of its own, which may load nothing from anywhere.
+    """Put a view and the HTML that stands beside it into a page of its own, which may load nothing from anywhere.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ def write_verification(
     sentence : str
         The answer in a sentence.
     place, corrected : Georeference or None
-        What the image says of its place, and what the roads say if that is another.
+        The place that the image states, and the place by the roads if that is another.
     index : ReferenceIndex or None
         The map that it was held against.
 

@@ -22,7 +22,7 @@ _AFTER_MS = 400
 
 
 def announce_ready(version: str) -> None:
-    """Report that the program is set up, in place of the question that asked for it, with what comes next."""
+    """Report that the program is set up, in place of the question that asked for it, with the next steps."""
     offered = {"Build road reference...": lambda: open_dialog("buildreference", {})}
     _menu().forget_question()
     QTimer.singleShot(
