@@ -24,7 +24,7 @@ def visible(text: str, *, lines: bool = False) -> str:
 
 
 def in_html(text: str) -> str:
-    """Return text for a page, or for other XML: as it is shown, with what would be markup."""
+    """Return text for a page, or for other XML: as it is shown, with characters that would be markup."""
     return html.escape(visible(text, lines=True))
 
 

@@ -206,7 +206,7 @@ def locate(
         Seconds after which the search stops.
     take : int or (longitude, latitude)
         The place, counted from 1 among `places` or nearest to this one, that is the answer; its status is "chosen".
-        Of an answer that is there already, `answer.take` takes a place without another search.
+        With an answer that is there already, `answer.take` takes a place without another search.
 
     Raises
     ------

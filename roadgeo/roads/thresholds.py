@@ -53,7 +53,7 @@ _BINS = 256  # of a histogram that a threshold is found by
 #: Further thresholds of a soft map, as shares of the way from the ground's value to the roads'.
 _FURTHER = (0.3, 0.7)
 #: A further threshold of probabilities, as a share of the model's own: roads count by their probability. On labelled
-#: photographs of Boston and Miami, told scale and heading, 8 of 12 are located at it, 7 at the model's own.
+#: photographs of Boston and Miami, given scale and heading, 8 of 12 are located at it, 7 at the model's own.
 _LOWER = 0.27
 
 

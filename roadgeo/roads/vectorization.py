@@ -51,8 +51,8 @@ _HOLE, _SPECK = 1.2, 1.0
 #: Road widths: free ends are dropped that reach less beyond the edge of the road they leave, and roads that touch no
 #: other and are shorter.
 _SPUR, _PIECE = 1.3, 2.0
-#: A road that ends, and points at another across a gap up to so many road widths, is joined to it; it may bend so far
-#: from its own direction to get there.
+#: A road that ends, and points at another across a gap up to this number of road widths, is joined to it; it may bend
+#: so far from its own direction to get there.
 _BRIDGE, _BRIDGE_DEG = 1.0, 35.0
 #: Road widths: so near a junction a skeleton is bent, and the road is drawn straight; standard deviation of the
 #: smoothing along a road.

@@ -1,4 +1,4 @@
-"""The work on one mask: it is read, located, written and described. What goes wrong with a mask is caught here."""
+"""The work on one mask: it is read, located, written and described. Errors of a mask are caught here."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ class Locating:
         )
 
     def _take(self, task: Task, asked: Asked, options: LocateOptions) -> Sighting | None:
-        """Take a place of the last answer for an image; None where there is no such answer, which is said."""
+        """Take a place of the last answer for an image; None, with a warning, where there is no such answer."""
         from roadgeo.outputs.location_document import read_answer
         from roadgeo.outputs.paths import output_paths
         from roadgeo.running.choosing import take_again

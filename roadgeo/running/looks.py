@@ -68,7 +68,7 @@ class Sighting:
         return replace(self, location=location)
 
     def showing(self, **content: Any) -> Sighting:
-        """Return it with more of what the image shows (see `location.Content`)."""
+        """Return it with more of the image's content (see `location.Content`)."""
         shown = self.location.content or Content(self.mask.shape[::-1])
         return self.told(replace(self.location, content=replace(shown, **content)))
 

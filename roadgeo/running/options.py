@@ -37,13 +37,13 @@ class ReadOptions:
     threads : int
         Threads of a model; fixed, so that results are the same on every run.
     mirror : bool or None
-        Whether what is given is mirrored. Default: as the georeference of its file says.
+        Whether the input is mirrored. Default: as the georeference of its file states.
     units : "auto", "pixels" or "metres"
         Unit of roads that come as lines (see `sources.drawn_roads`).
     layer : tuple of str
         Layers of such roads, where their file has several.
     aspect : float or None
-        How many times a pixel is as wide as high. Default: as the georeference of its file says, or once.
+        How many times a pixel is as wide as high. Default: as the georeference of its file states, or once.
     bands : (3,) tuple of int, or None
         The red, green and blue band of a photograph, counted from 1. Default: by their names, or the first three.
     """
@@ -63,7 +63,7 @@ class ReadOptions:
 
     @property
     def choice(self) -> Choice:
-        """What is read of a raster that may be a mask."""
+        """The bands and values that are read of a raster that may be a mask."""
         from roadgeo.sources.bands import Choice
 
         is_number = self.class_name is not None and self.class_name.isdecimal()

@@ -94,7 +94,7 @@ class Frame:
     coarser : float
         Pixels of the photograph for each of the grid, along a side.
     n_scales, n_further : int
-        Number of scales worth trying; and of those beyond a scale that is told. That says how large the ground is, not
+        Number of scales worth trying; and of the ones beyond a given scale. That states how large the ground is, not
         at which scale the model sees it best.
     """
 

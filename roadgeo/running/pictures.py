@@ -63,7 +63,7 @@ def read_picture(picture: Any) -> str | AnyArray:
 
 
 def pixels_of(picture: Any) -> dict[str, Any]:
-    """Return what xarray says of a picture, as fields of `ReadOptions`: names of bands, shape of pixels, order of rows.
+    """Return xarray's notes on a picture, as fields of `ReadOptions`: names of bands, shape of pixels, order of rows.
 
     PIL states the shape of pixels by their resolution.
     Its `attrs["long_name"]` or the coordinates of its third axis are names. Axes called lat and lon, or a geographic

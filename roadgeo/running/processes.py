@@ -96,7 +96,7 @@ class Processes:
         clean : callable, optional
             What they do where this process is killed.
         within : Fence, optional
-            A fence that they enter; by default that of this process.
+            A fence that they enter; by default this process's own.
         """
         self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
         self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
@@ -214,7 +214,7 @@ class _Process:
         return said[0]
 
     def tell_to_end(self) -> None:
-        """Tell it to end."""
+        """Ask it to end."""
         if (process := self.process) is not None:
             process.terminate()
 
@@ -233,7 +233,7 @@ _parents: list[Connection] = []
 
 
 def tell(text: str, share: float | None = None) -> None:
-    """Tell whoever waits for the task that this process does how far it is."""
+    """Report how far this process's task is, to the process that waits for it."""
     for pipe in _parents:
         pipe.send(("told", text, share))
 

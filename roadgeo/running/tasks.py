@@ -50,7 +50,7 @@ VIDEOS = (
         ".amv",
     ),
 )
-#: What lies beside pictures, and nobody expects to be one: world files, side files, indexes, text.
+#: Files that lie beside pictures, and that nobody expects to be pictures: world files, side files, indexes, text.
 _BESIDE = re.compile(
     r"\.(\w{1,4}w|wld|prj|qpj|xml|xmp|ovr|msk|aux|rrd|qml|qgs|qgz|index|txt|md|csv|tsv|json|html?|log|ya?ml|toml|srt)"
 )
@@ -93,7 +93,7 @@ def find_masks(arguments: Sequence[str], recursive: bool = False, suffixes: tupl
 def in_natural_order(name: str, decimals: bool = True) -> list[str | tuple[int, str]]:
     """Return a key by which names are sorted as people count: numbers within them by their values.
 
-    One point between two numbers makes a decimal, where `decimals` says so; more of them part a date or a version.
+    One point between two numbers makes a decimal, where `decimals` is true; more of them part a date or a version.
     """
     number = r"((?<![\d.])\d+\.\d+(?!\.?\d)|\d+)" if decimals else r"(\d+)"
     parts = [part.partition(".") if k % 2 else part for k, part in enumerate(re.split(number, name))]
@@ -101,7 +101,7 @@ def in_natural_order(name: str, decimals: bool = True) -> list[str | tuple[int, 
 
 
 def _in_order(names: Iterable[str]) -> list[str]:
-    """Sort names, and say so where decimals in them may mean something else."""
+    """Sort names, and print a line where decimals in them may mean something else."""
     found = sorted(names, key=in_natural_order)
     whole = sorted(found, key=partial(in_natural_order, decimals=False))
     if found != whole:
@@ -164,7 +164,7 @@ def _is_mask(path: Path, endings: tuple[str, ...], suffixes: tuple[str, ...]) ->
 def name_tasks(masks: Sequence[str], out_dir: str | os.PathLike[str] | None = None) -> list[Task]:
     """Give each mask the stem of its own name; those that would share one get more of their path, until none does.
 
-    So do masks whose results would replace those of another picture in a folder.
+    So do masks whose results would replace another picture's in a folder.
 
     So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
     """

@@ -1,7 +1,7 @@
 """Variants of a query: mirrored back, with square pixels, or on another grid of pixels.
 
 A scanner, or an array upside down, mirrors a mask; a raster in degrees, or a picture made to fit a page, samples the
-ground finer along one side. What is known of that, by hand or by the file, is undone before the search, and the place
+ground finer along one side. The part that is known, by hand or by the file, is undone before the search, and the place
 is given in pixels of the mask.
 """
 

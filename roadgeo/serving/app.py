@@ -269,7 +269,7 @@ class Service:
 
 
 def _query_of(request: Request) -> str:
-    query: bytes = request.scope["query_string"]  # `request.url` begins with what the client calls the host
+    query: bytes = request.scope["query_string"]  # `request.url` begins with the client's name of the host
     return query.decode("latin-1")
 
 

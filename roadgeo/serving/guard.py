@@ -21,7 +21,7 @@ __all__ = ["COOKIE", "Guard", "is_same", "pass_of", "problem"]
 
 #: Under this name a browser shows that it was given the token.
 COOKIE = "roadgeo"
-#: Wrong tokens, of all who ask, are answered one after another, so long after each other, seconds.
+#: Wrong tokens, of all who ask, are answered one after another, with this time between them, seconds.
 _GUESS_S = 0.5
 #: Longest body of a request that brings a token.
 _TOKEN_BYTES = 4096
@@ -121,7 +121,7 @@ def _split(address: str) -> tuple[str, str | None]:
 
 
 def _limit(receive: Receive, most: int, body_s: float) -> Receive:
-    """Bound a body in size and time; what comes after it, such as that the client has gone, is waited for."""
+    """Bound a body in size and time; messages after it, such as that the client has gone, are waited for."""
     until, taken, is_whole = 0.0, 0, False
 
     async def take() -> Message:

@@ -93,7 +93,7 @@ class Job:
         old.set()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return its state as it is told to clients."""
+        """Return its state as clients receive it."""
         return {"jobID": self.id, "status": self.status, "message": self.message, "progress": self.progress}
 
     async def watch(self) -> AsyncIterator[dict[str, Any] | None]:

@@ -34,7 +34,7 @@ _GRACE_S = 15.0
 #: The same where progress is reported, and the client may cancel: a busy machine is no fault.
 _PATIENT_S = 90.0
 
-#: The status of what is lost, and the sentence about it.
+#: The status of a lost task, and the sentence about it.
 _LOST = {
     "died": (500, "it broke two processes, one after another; send another image"),
     "late": (503, "it took {} and was ended; reduce the image, or come again when less is asked"),

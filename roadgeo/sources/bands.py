@@ -29,14 +29,14 @@ _MAX_CLASSES = 32  # whose colours a palette holds
 _MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _MOST_LISTED = 8
 
-#: Words for roads in names of bands, and words for what is said of roads, or for all else.
+#: Words for roads in names of bands, and words for properties of roads, or for all else.
 _ROADS = re.compile(r"\b(?:road|street|highway|stra(?:ss|ß)e|route|estrada|carreter|calle|strad[ae])[^\W\d]*", re.I)
 _OTHERS = re.compile(r"\b(?:no|non|not|off|age|background|distance|count|uncertain\w*|std|var\w*|entropy)\b", re.I)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What is to be read of a raster.
+    """The bands and values that are to be read of a raster.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Raster:
     has_alpha : bool
         Values are valid where they are not transparent.
     model_threshold : float or None
-        Of a map of probability that we wrote.
+        Threshold of a map of probability that we wrote.
     """
 
     name: str

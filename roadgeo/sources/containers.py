@@ -43,7 +43,7 @@ _SHAPES, _TEXTS = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape
 _SRID, _HEX = re.compile(r"\s*SRID\s*=\s*(\d{1,9})\s*;", re.IGNORECASE), re.compile(r"[0-9A-Fa-f]{18,}")
 _INIT = re.compile(r"\{'init': '(epsg:\d{1,9})'.*\}", re.IGNORECASE)  # a CRS as osmnx wrote it before 0.12
 _PEEK = 1000
-#: What services write into an answer that is a part of what was asked for: ArcGIS, WFS, OGC API - Features.
+#: Notes that services write into an answer that is a part of the request: ArcGIS, WFS, OGC API - Features.
 _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d{1,12})")
 _LIMITED = re.compile(
     rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^<>]*\bnext\s*=\s*[\"']\w"
@@ -51,9 +51,9 @@ _LIMITED = re.compile(
 #: Formats of a feature a line; and the name of an XML file's outermost element, behind what may come before it.
 _BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
 _ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*+(?:<[?!].*?>\s*+)*+<([\w:.-]+)"), 1 << 12
-_ENDS_BYTES = 1 << 16  # of a file, where it says so
+_ENDS_BYTES = 1 << 16  # of a file, where such a note stands
 _TILES = "vector tiles, which cut roads at their borders and simplify them; give the data that they were made of"
-#: Formats that are not read, and what their users do.
+#: Formats that are not read, and the way out for their users.
 _ELSEWHERE = {
     **dict.fromkeys((".mbtiles", ".pmtiles", ".mvt"), _TILES),
     ".osc": "holds changes alone; apply them to their map (osmium apply-changes), and give that",
@@ -206,7 +206,7 @@ def _levels(path: Path, layer: str, areas: bool) -> tuple[str, list[str]]:
 
 
 def _names_of(values: AnyArray, path: Path) -> list[str]:
-    """Return the names of layers in a column; of other files than drawings no numbers: they say what is above what."""
+    """Return the names of layers in a column; of other files than drawings no numbers: they give the drawing order."""
     named = {str(value) for value in values if value is not None}
     is_drawing = path.name.lower().endswith(_DRAWINGS)
     return sorted(name for name in named if is_drawing or not re.fullmatch(r"[-+]?[\d.]+|nan", name))
@@ -222,7 +222,7 @@ def _is_filled(path: Path, layer: str) -> bool:
 def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
     """Return the size of a layer, and its columns that may describe a road: by their names, else by their values.
 
-    The third is which layers of a drawing its rows come from, for people; "" where it does not say, or from one.
+    The third is which layers of a drawing its rows come from, for people; "" where this is unknown, or from one.
     """
     total, fields = describe_layer(path, layer)
     known = [name for name in fields if is_known_column(name)]
@@ -261,7 +261,7 @@ def _require_whole(path: Path) -> None:
 
 
 def what_is_missing(path: Path, n_features: int) -> str:
-    """Return what an answer of a service says of features that it left out: "" where it is whole, or says nothing."""
+    """Return the note of a service's answer on features that it left out: "" where it is whole, or has no note."""
     ending = path.suffix.lower()
     if ending not in (".json", ".geojson", ".gml"):
         return ""
@@ -319,7 +319,7 @@ def _require_rows(rows: int, size: int) -> None:
 def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> tuple[str, Any, str]:
     """Return the geometry column of a table of Arrow's or of Parquet, its CRS and its encoding.
 
-    `first` returns a value of a column, by which it is known where no name tells.
+    `first` returns a value of a column, by which it is known where no name shows it.
     """
     stored = schema.metadata or {}
     if b"geo" in stored:

@@ -68,7 +68,7 @@ def draw_roads(
     layer : str or sequence of str, optional
         Layers of a file with several.
     units : "auto", "pixels" or "metres"
-        Units of their coordinates. By default those of the CRS that the file names, if they fit it, and pixels of a
+        Units of their coordinates. By default the units of the CRS that the file names, if they fit it, and pixels of a
         picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
 
     Raises

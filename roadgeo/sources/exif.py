@@ -66,7 +66,7 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
 
 
 def read_time(path: str | os.PathLike[str]) -> float | None:
-    """Return when a photograph was taken by its own clock, seconds since 1970; None where EXIF does not say."""
+    """Return when a photograph was taken by its own clock, seconds since 1970; None where EXIF does not give it."""
     taken, part = (read_tag(path, tag, _EXIF) for tag in (_TAKEN, _PART_OF_SECOND))
     try:
         moment = datetime.strptime(str(taken), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)

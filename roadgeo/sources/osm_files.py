@@ -28,7 +28,7 @@ OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", 
 #: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
 _NODES_IN_MEMORY = 100_000_000
 #: An object that JOSM's user has deleted stays in its file.
-#: Each pattern here gives up at the next tag: what has no end is looked at once, not once for each beginning.
+#: Each pattern here gives up at the next tag: an element without an end is looked at once, not once for each beginning.
 _WAY = re.compile(rb"<way\b([^<>]*+)")
 _IS_DELETED, _ID = re.compile(rb"\baction=[\"']delete"), re.compile(rb"\bid=[\"'](-?\d{1,18})[\"']")
 #: Overpass ends an answer so that it could not complete.

@@ -44,7 +44,7 @@ _BUSY = (429, 504)  # osmnx waits a minute, and asks again without end
 _MOST_TRIES = 5
 _MOST_AGE_S = 30 * 86400.0
 _TAIL_BYTES = 4096  # of an answer, where Overpass puts its remark
-#: An answer of osmnx's largest area, of a dense city, has some 100 MB; servers give up before they take so long.
+#: An answer of osmnx's largest area, of a dense city, has some 100 MB; servers give up before this time.
 _MOST_BYTES, _MOST_S, _CHUNK = 256 << 20, 600.0, 1 << 20
 
 
@@ -324,7 +324,7 @@ class _Watch:
             )
 
     def _receive(self, response: Any) -> None:
-        """Receive the body, within bounds of size and time: both are of what is unpacked, and of all of it."""
+        """Receive the body, within bounds of size and time: both bounds are of the unpacked body, and of all of it."""
         until, taken, parts = time.monotonic() + _MOST_S, 0, []
         for part in response.iter_content(_CHUNK):
             taken += len(part)

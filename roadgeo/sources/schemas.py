@@ -56,7 +56,7 @@ _OSM = _WORDS[_OSM_NAME] | _by_word({word: [word] for word in KNOWN_HIGHWAYS} | 
 _WORDS[_OSM_NAME] = _OSM
 _HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
 _OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHER_KEYS}
-#: Words that say of a line that it is a road, or none, whatever column they stand in.
+#: Words that show that a line is a road, or none, whatever column they stand in.
 _CERTAIN = {
     maker: {
         word: kind for word, kind in words.items() if word not in {*map(_plain, _DATA["ambiguous"])} and "*" not in word
@@ -94,7 +94,7 @@ class Schema:
         A line without a kind is something else, as in a table of OpenStreetMap's.
     attribution : str
     is_guess : bool
-        Of the columns none has a name that is known for kinds of roads alone.
+        None of the columns has a name that is known for kinds of roads alone.
     """
 
     kinds: tuple[tuple[str, Mapping[str, str]], ...] = ()
@@ -197,7 +197,7 @@ def _named(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
 
 
 def _words_of(values: AnyArray, sure: bool = False) -> tuple[str, Mapping[str, str]]:
-    """Return the maker of maps whose words most filled values are, and those of its words that are believed.
+    """Return the maker of maps whose words most filled values are, and its words that are believed.
 
     In a column of a name that is not `sure`, all are where several of them can be nothing but roads; otherwise those
     that can be nothing else, if most are. "" without a maker.

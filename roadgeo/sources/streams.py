@@ -31,7 +31,7 @@ _LOG = logging.getLogger(__name__)
 #: Files that hold lines, not pixels, by their names.
 QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
 
-#: What lies beside road files, or tells of them.
+#: Files that lie beside road files, or describe them.
 _BESIDE = re.compile(
     r"\.(shx|dbf|prj|cpg|sbn|sbx|qpj|qix|qmd|qml|lyrx?|idm|ind|dat|id|map|mid|index|gfs|xsd|aux|xml|txt|md|html?|pdf|log)"
 )

@@ -4,10 +4,10 @@ A stranger's file may name other files in ways that nobody knows but the library
 system refuses to open them, whatever asks for it. It is Linux's Landlock (version 5.13 and later), which needs no
 privilege and cannot be taken down again: https://docs.kernel.org/userspace-api/landlock.html
 
-Readable are Python, installed packages, the system's libraries and data, and what is given, each file with those that
+Readable are Python, installed packages, the system's libraries and data, and the given files, each with the files that
 share its stem. Results are made where nothing is read: in a folder within theirs, which is the process's own, and
 renamed from there (`storage.files`). Temporary files lie in a folder of this process, too. Landlock fences the thread
-that asks for it, and what that starts: threads of before stay outside.
+that asks for it, and the threads and processes that it starts: earlier threads stay outside.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ _VERSION, _BENEATH = 1, 1  # flag that asks for the ABI; type of a rule
 
 #: Rights, by their bits.
 _EXECUTE, _WRITE, _READ, _LIST, _REMOVE_FOLDER, _REMOVE, _TRUNCATE = 1, 2, 4, 8, 16, 32, 1 << 14
-_MAKE = 0b1011110 << 6  # of what is made: no devices
+_MAKE = 0b1011110 << 6  # rights to make files of all kinds but devices
 _REFER = 1 << 13  # a file may change its folder
 _OF_FILES = _EXECUTE | _WRITE | _READ | _TRUNCATE
 _ALL = (1 << 15) - 1
-_KNOWN = {1: (1 << 13) - 1, 2: (1 << 14) - 1}  # what is known to an ABI; later ones know all
+_KNOWN = {1: (1 << 13) - 1, 2: (1 << 14) - 1}  # rights that an ABI knows; later ones know all
 _NETWORK_ABI, _CONNECTIONS = 4, 0b11  # bind and connect, of TCP
 
 _RUN, _LOOK, _USE = _READ | _LIST | _EXECUTE, _READ | _LIST, _READ | _WRITE
 _RESULTS = _LIST | _MAKE | _REMOVE | _REMOVE_FOLDER | _REFER
 _OWN = _RESULTS | _USE | _TRUNCATE
 
-#: The system's own. Of /etc and /proc only what libraries need: the rest tells of users and of their programs.
+#: The system's own. From /etc and /proc, only files that libraries need: the rest describes users and their programs.
 _SYSTEM: tuple[str, ...] = (
     "/usr",
     "/lib",
@@ -100,14 +100,14 @@ _REFUSED = re.compile(r"Permission denied|Operation not permitted")
 
 @dataclass(frozen=True)
 class Fence:
-    """What a process may open; it travels to other processes.
+    """The files that a process may open; it travels to other processes.
 
     Attributes
     ----------
     read : tuple of str
         Files, with those that share their stem, and folders with all that is in them.
     results : tuple of str
-        Folders that get results; what lies there is not read.
+        Folders that get results; the files there are not read.
     write : tuple of str
         Folders, or files, that are written and read.
     network : bool
@@ -123,7 +123,7 @@ class Fence:
     temporary: str = ""
 
     def enter(self) -> bool:
-        """Put this thread, and what it starts from now on, inside; return whether this system can do that.
+        """Put this thread, and all that it starts from now on, inside; return whether this system can do that.
 
         Raises
         ------
@@ -146,11 +146,11 @@ class Fence:
         return True
 
     def _prepare(self) -> None:
-        """Make the folders that are to be written, temporary ones too; what is looked up elsewhere is settled here."""
+        """Make the folders that are to be written, temporary ones too; lookups elsewhere are settled here."""
         with contextlib.suppress(RuntimeError):
             os.environ.setdefault("HOME", str(Path.home()))  # else the system's list of users is read
         for folder in (path for path in self.write if not Path(path).is_file()):
-            with contextlib.suppress(OutputError):  # whoever writes there will say so
+            with contextlib.suppress(OutputError):  # whoever writes there will report it
                 make_folder(folder)
         self._staged()
         kept = cache_dir()
@@ -168,7 +168,7 @@ class Fence:
         return folders
 
     def _rules(self, abi: int) -> Iterator[tuple[str, int]]:
-        """Yield paths, and what may be done with them."""
+        """Yield paths, and the rights to them."""
         yield from ((path, _RUN) for path in (*_SYSTEM, *_of_python()))
         yield from ((f"/etc/{name}", _LOOK) for name in _ETC)
         yield from ((f"/dev/{name}", _USE) for name in _DEVICES)
@@ -200,12 +200,12 @@ def is_started_inside() -> bool:
 
 
 def is_inside() -> bool:
-    """Whether this process is inside a fence, its own or that of the one that started it."""
+    """Whether this process is inside a fence, its own or its parent's."""
     return _INSIDE in os.environ
 
 
 def remedy(reason: str) -> str:
-    """Return how to have a file read that an error says was not opened; "" for other errors, and outside."""
+    """Return how to have a file read that, by an error, was not opened; "" for other errors, and outside."""
     if not (is_inside() and _REFUSED.search(reason)):
         return ""
     return "; only files that were named are opened: to have others read that they name, --allow their folder"
@@ -264,7 +264,7 @@ def _stems(name: str) -> set[str]:
 
 
 def _make_temporary_folder(where: str) -> None:
-    """Make a folder for what is temporary, of this process and of those that it starts."""
+    """Make a folder for temporary files, of this process and of the ones that it starts."""
     with writing(where):
         folder = tempfile.mkdtemp(prefix="roadgeo-", dir=where)
     from multiprocessing.util import Finalize

@@ -34,7 +34,7 @@ __all__ = [
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 _NAME = r"\.roadgeo-[0-9a-f]{12}\.tmp"
 _STAGED = rf"{_NAME}[/\\\\]"
-#: Variable that tells processes that we start under which name staging folders lie together (see `stage`).
+#: Variable that gives processes that we start the name under which staging folders lie together (see `stage`).
 _STAGE = "ROADGEO_STAGE"
 
 #: Staging folders of this process, not of one that it was forked from.

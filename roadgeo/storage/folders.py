@@ -33,7 +33,7 @@ def cache_dir() -> Path:
 
 
 def user_dir(on_mac: str, variable: str, usual: str) -> Path:
-    """Folder of the user's files of one kind: in Windows' local data, macOS's Library, or as XDG's variable says."""
+    """Folder of the user's files of one kind: in Windows' local data, macOS's Library, or by XDG's variable."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     if sys.platform == "darwin":

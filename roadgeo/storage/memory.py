@@ -1,4 +1,4 @@
-"""Memory: how much of it readers of strangers' files may take, and what is given back to the system."""
+"""Memory: how much of it readers of strangers' files may take, and memory that is given back to the system."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ __all__ = ["MEMORY", "bounded", "each_bounded", "give_back_memory", "let_pages_g
 
 _Part = TypeVar("_Part")
 
-#: Variable that tells how much memory the reading of a file may take, GB.
+#: Variable that states how much memory the reading of a file may take, GB.
 MEMORY = "ROADGEO_MEMORY"
-#: Else it is so many bytes, and beyond them a multiple of the file's size, but no more than half of what is free.
+#: Else it is this number of bytes, and beyond them a multiple of the file's size, but no more than half of free memory.
 _FREE, _TIMES = 1 << 30, 100
 
 
 @contextlib.contextmanager
 def bounded(path: str | os.PathLike[str], before: int | None = None) -> Iterator[None]:
-    """Bound the memory that the block takes to read a file: inside the fence, or where ROADGEO_MEMORY says how much.
+    """Bound the memory that the block takes to read a file: inside the fence, or where ROADGEO_MEMORY sets how much.
 
     The bound is one of the whole process, and so not for programs that merely use roadgeo.
 

@@ -1,4 +1,4 @@
-"""What a picture says of itself in the tags of TIFF and EXIF; and its orientation, by the tag of that name.
+"""The tags of TIFF and EXIF by which a picture describes itself; and its orientation, by the tag of that name.
 
 Viewers, browsers, PIL's `exif_transpose` and `cv2.imread` show a picture upright; GDAL and QGIS show it as stored.
 Here pictures are upright, from `storage.rasters` on; outputs for programs that ignore the tag use the stored order.
@@ -56,7 +56,7 @@ def read_tag(path: str | os.PathLike[str], tag: int, *within: int) -> tuple[Any,
     Parameters
     ----------
     within : int
-        Tags of the directories to go down to, such as those of EXIF and of GPS.
+        Tags of the directories to go down to, such as EXIF's and GPS's.
     """
     try:
         with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
@@ -78,7 +78,7 @@ def read_tag(path: str | os.PathLike[str], tag: int, *within: int) -> tuple[Any,
 
 
 def read_resolution(path: str | os.PathLike[str]) -> tuple[float, float]:
-    """Return the pixels in a unit of length along rows and along columns, where such a file says; else (0, 0)."""
+    """Return the pixels in a unit of length along rows and along columns, where such a file gives it; else (0, 0)."""
     across, down = (next(iter(read_tag(path, tag) or ()), 0.0) for tag in _RESOLUTION)
     found = float(across), float(down)
     try:

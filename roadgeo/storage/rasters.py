@@ -82,7 +82,7 @@ _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the 
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
 
-#: Endings of raw photographs, and tags of TIFF by which they are known: what of them GDAL reads is a thumbnail.
+#: Endings of raw photographs, and tags of TIFF by which they are known: GDAL reads only their thumbnail.
 RAW = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw")
 _DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE, _OLD_SUBFILE_TYPE = 50706, 330, 254, 255
 _IN_PART = 0b101  # bits of a type: a reduced picture, a mask of transparency

@@ -247,7 +247,7 @@ def _open_session(content: bytes, threads: int) -> Any:
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
     options.add_session_config_entry("session.use_env_allocators", "1")  # set by `_limit_memory`
-    options.add_session_config_entry("session.load_model_format", "ONNX")  # what was looked at, whatever else it may be
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # as checked, whatever else it may be
     # Constants that operators make are made while the model runs, when memory is bounded.
     return onnxruntime.InferenceSession(
         content, options, ["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"], enable_fallback=0

@@ -59,7 +59,7 @@ class Photograph:
     page: str = ""
 
     def stretched(self, wide: float, high: float) -> Photograph:
-        """Return the same with so many columns and rows for each of its own."""
+        """Return the same with these numbers of columns and rows for each of its own."""
 
         def read(
             left: float, top: float, width: float, height: float, shape: tuple[int, int]

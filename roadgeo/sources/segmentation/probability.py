@@ -119,7 +119,7 @@ class ProbabilityMap:
 
 
 def mean_of(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
-    """Return the mean of the log odds of what a model saw in several ways, (H, W) of the first.
+    """Return the mean of the log odds that a model gave in several ways, (H, W) of the first.
 
     At each pixel those count that observed it.
     """
