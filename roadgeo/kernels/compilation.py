@@ -239,9 +239,9 @@ _MATCHING = (
     "road_votes",
     "road_growth",
 )
-#: What a map needs: the first thing that a newcomer makes.
+#: The kernels that a map needs: the first thing that a newcomer makes.
 _MAPS = ("simplification", "parallel_roads", "intersections", "buckets", "triple_codes", "roads")
-#: What processes of their own compile, each in this order.
+#: Modules that processes of their own compile, each in this order.
 _GROUPS = (
     _MAPS,
     ("thinning", "tracing", "triples", "point_matching"),

@@ -33,7 +33,7 @@ _IN_EVERY_PROCESS = _C | {*_MATH, *(f"{name}f" for name in _MATH)}
 
 
 class Kernel(Protocol):
-    """What is compiled (see `compilation.Kernel`)."""
+    """A function to be compiled (see `compilation.Kernel`)."""
 
     name: str
     arguments: tuple[Kind, ...] | None

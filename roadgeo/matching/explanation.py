@@ -145,7 +145,7 @@ class Story:
             "needed": {"log10_odds": self.needed},
             "funnel": asdict(self.funnel),
             "missing": list(self.missing),
-            "places": [told.to_dict() for told in self.places],
+            "places": [listed.to_dict() for listed in self.places],
             "truth": self.truth and asdict(self.truth),
         }
 
@@ -168,7 +168,7 @@ class Explanation:
         """The story of the reference on which the mask was located, or came nearest to it."""
 
         def rank(story: Story) -> tuple[bool, float]:
-            best = max((told.place.score for told in story.places), default=-math.inf)
+            best = max((listed.place.score for listed in story.places), default=-math.inf)
             return self.location.located and story.reference == self.location.reference, best
 
         return max(self.stories, key=rank)

@@ -123,7 +123,7 @@ def search_references(
             return _search(query, coarse + fine, options, time_limit_s, explained, ahead, proposed)
         started = time.perf_counter()
         first = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead, proposed)
-        if any(one.stopped == "accepted" for one in first):
+        if any(result.stopped == "accepted" for result in first):
             return first
         spent_s = time.perf_counter() - started
         begun, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead, proposed)
@@ -135,13 +135,13 @@ def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], l
     coarse = [part for part in parts if part.coarseness > 1.0]
     fine = [part for part in parts if part.coarseness == 1.0]
     largest_m = options.match.camera.gsd_m[1]
-    return [one for one in coarse if largest_m > one.coarseness * COARSE_PIXEL_M or not fine], fine
+    return [part for part in coarse if largest_m > part.coarseness * COARSE_PIXEL_M or not fine], fine
 
 
 def _at_first_look(coarse: Sequence[Part], options: LocateOptions) -> LocateOptions:
     """Return the options for a search of coarse maps alone: a quick search, unless pixels are large enough for them."""
     least_m = options.match.camera.gsd_m[0]
-    if all(least_m >= one.coarseness * COARSE_PIXEL_M for one in coarse):
+    if all(least_m >= part.coarseness * COARSE_PIXEL_M for part in coarse):
         return options
     search = replace(options.search, work_limit_s=min(_FIRST_LOOK_S, options.search.work_limit_s))
     return replace(options, effort="quick", search=search)
@@ -167,20 +167,20 @@ def _search(
         return _search_pairs_in_turn(query, indexes, options, time_limit_s)
     started, ledger = time.perf_counter(), Ledger()
     sweeps = SharedSweeps(query.scene, options.match.camera, ahead)
-    begun = [_begin(query, one, options, Events(explained), ledger, sweeps) for one in indexes]
-    for one in begun:
-        if one.estimator is not None and proposed:
-            here = (matrix for index, matrix in proposed if index is one.index)
-            one.estimator.proposed = [Place(query.scene, one.estimator.index, matrix) for matrix in here]
-    together = [one.estimator for one in begun if one.estimator is not None]
+    begun = [_begin(query, index, options, Events(explained), ledger, sweeps) for index in indexes]
+    for result in begun:
+        if result.estimator is not None and proposed:
+            here = (matrix for index, matrix in proposed if index is result.index)
+            result.estimator.proposed = [Place(query.scene, result.estimator.index, matrix) for matrix in here]
+    together = [result.estimator for result in begun if result.estimator is not None]
     units = sum(n_units(len(estimator.index)) for estimator in together)
     for estimator in together:
         estimator.in_company = units > 1
     estimators = {Search(estimator): estimator for estimator in together}
-    ledger.n_reference = sum(one.n_searched for one in begun if one.estimator is not None)
+    ledger.n_reference = sum(result.n_searched for result in begun if result.estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
-    scale = larger(sum(one.n_searched for one in begun))
+    scale = larger(sum(result.n_searched for result in begun))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, rivals)
@@ -190,7 +190,10 @@ def _search(
         estimators = _search_alone(together, options, ledger, left)
         rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     searches = iter(estimators)
-    return [one if one.estimator is None else _end(one, one.estimator, next(searches), rivals, scale) for one in begun]
+    return [
+        result if result.estimator is None else _end(result, result.estimator, next(searches), rivals, scale)
+        for result in begun
+    ]
 
 
 def _search_alone(
@@ -339,9 +342,9 @@ def _search_pairs_in_turn(
     work_s, time_s = min(pair.work_limit_s, options.search.work_limit_s), min(pair.time_limit_s, time_s)
     for n_left in range(len(indexes), 0, -1):
         share = replace(pair, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
-        one = _search_pairs(query, indexes[-n_left], share)
-        work_s, time_s = max(work_s - one.stats.work_ms / 1000, 0.0), max(time_s - one.match_s, 0.0)
-        searched.append(one)
+        result = _search_pairs(query, indexes[-n_left], share)
+        work_s, time_s = max(work_s - result.stats.work_ms / 1000, 0.0), max(time_s - result.match_s, 0.0)
+        searched.append(result)
     return searched
 
 

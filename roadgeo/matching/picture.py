@@ -8,7 +8,7 @@ b = (1 - p) / (1 - pi). Under a place H
              + sum over the other ground    log[ (1 - f pi) b + f pi s ]
 
 with m the share of the map's roads that the picture lacks, and f the density of roads that the map lacks, in parts of
-the picture's own. Both are marginalised over a small grid. A place that says nothing has log L = 0. A drawn mask is a
+the picture's own. Both are marginalised over a small grid. A place without evidence has log L = 0. A drawn mask is a
 picture of two probabilities. Neighbouring cells agree together, so `_STATEMENT_M` metres of road count once.
 
 All shifts of a place are compared at once: the rectified picture is correlated with the map by FFT.

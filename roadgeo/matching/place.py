@@ -79,7 +79,7 @@ class Place:
         return replace(self, matrix=refined.matrix, refined=refined, scene=scene, grown=None, by=None)
 
     def but(self, **changes: Any) -> Place:
-        """Return the place with other results; what follows from its homography is not computed anew."""
+        """Return the place with other results; values that follow from its homography are not computed anew."""
         other = replace(self, **changes)
         vars(other).update({name: value for name, value in vars(self).items() if name not in _FIELDS})
         return other
@@ -144,7 +144,7 @@ class Place:
 
     @cached_property
     def evidence(self) -> Evidence:
-        """What weighs places of its scene on its map, by its own scale."""
+        """The yardstick that weighs places of its scene on its map, by its own scale."""
         return Evidence(self.scene, self.index, self.gsd_m)
 
     @cached_property

@@ -106,7 +106,9 @@ class _TruePlace:
         survived = sum(self._lies_there(matrix) for grown in events.of("grown") for matrix in grown)
         counts |= {"survived": survived, "camera": len(faults), "verified": len(settled)}
         listed = (*searched.compared, *searched.places[1:])
-        scores = [place.score for place in listed if self._is_there(place)] or [min(one.score, 0.0) for one in settled]
+        scores = [place.score for place in listed if self._is_there(place)] or [
+            min(place.score, 0.0) for place in settled
+        ]
         return counts, faults, max(scores, default=-math.inf)
 
     def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:

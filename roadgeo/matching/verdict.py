@@ -55,8 +55,8 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
     if options.method == "pair":
         return _decide_pairs(location, query, searched, options)
     # The best place of all references, and the others.
-    better = next((one.better for one in searched if one.better is not None), None)
-    compared = _ranked([place for one in searched for place in one.compared], options.min_log10_odds)
+    better = next((result.better for result in searched if result.better is not None), None)
+    compared = _ranked([place for result in searched for place in result.compared], options.min_log10_odds)
     if better is not None:
         return _fits_elsewhere(location, [better, *_listed(searched, compared)][:N_PLACES], options)
     best, rivals = (compared[0] if compared else None), compared[1:]
@@ -84,15 +84,15 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
 
 def _describe_work(query: Query, searched: Sequence[Searched]) -> Location:
     """Return the fields that do not depend on the answer."""
-    stats = [one.stats for one in searched]
+    stats = [result.stats for result in searched]
     work = Stats(
-        sum(one.tuples_sampled for one in stats),
-        sum(one.candidates for one in stats),
-        sum(one.hypotheses for one in stats),
-        sum(one.verified for one in stats),
-        sum(one.work_ms for one in stats),
+        sum(own.tuples_sampled for own in stats),
+        sum(own.candidates for own in stats),
+        sum(own.hypotheses for own in stats),
+        sum(own.verified for own in stats),
+        sum(own.work_ms for own in stats),
     )
-    match_s, refine_s = sum(one.match_s for one in searched), sum(one.refine_s for one in searched)
+    match_s, refine_s = sum(result.match_s for result in searched), sum(result.refine_s for result in searched)
     seconds = replace(query.seconds, match=match_s, refine=refine_s)
     content = Content(query.scene.size, query.graph, query.scene.intersections.xy)
     return Location(query.name, "not_located", "", content=content, spent=Spent(seconds, work, _ended_by(searched)))
@@ -100,7 +100,7 @@ def _describe_work(query: Query, searched: Sequence[Searched]) -> Location:
 
 def _ended_by(searched: Sequence[Searched]) -> str:
     """Return why a search of one or more parts ended: an answer, a limit, or nothing left to try."""
-    ends = {one.stopped for one in searched}
+    ends = {result.stopped for result in searched}
     return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
 
@@ -131,7 +131,7 @@ def _ranked(pool: Sequence[Place], needed: float) -> list[Place]:
 def _distinct(pool: Sequence[Place], known: Sequence[Place] = ()) -> list[Place]:
     """Return the places that are not known, the best first, each once; places of one search are different."""
     distinct = list(known)
-    for place in sorted(pool, key=lambda one: (-one.explained, -one.score)):
+    for place in sorted(pool, key=lambda place: (-place.explained, -place.score)):
         if not any(place.index is not other.index and place.same(other) for other in distinct):
             distinct.append(place)
     return distinct[len(known) :]
@@ -141,14 +141,14 @@ def _listed(searched: Sequence[Searched], compared: Sequence[Place]) -> list[Pla
     """Return the places that an answer lists: those that were compared, then others that were verified."""
     if not compared:
         return []
-    further = _distinct([place for one in searched for place in one.places[1:]], compared)
+    further = _distinct([place for result in searched for place in result.places[1:]], compared)
     return [*compared, *further][:N_PLACES]
 
 
 def _against(best: Place, rivals: Sequence[Place], needed: float) -> Place:
     """Return a place with its lead over the places on all references that lead their own."""
-    others = [one for one in rivals if one.index is not best.index and one.score >= needed]
-    leads = [best.explained - one.explained for one in others]
+    others = [rival for rival in rivals if rival.index is not best.index and rival.score >= needed]
+    leads = [best.explained - rival.explained for rival in others]
     return best.but(score=min([best.score, *(lead / best.statement_px for lead in leads)]))
 
 
@@ -159,9 +159,9 @@ def _equal(best: Place, rivals: Sequence[Place], listed: Sequence[Place], needed
     with which it stands out from all others. Otherwise it is a rival without which the best place would be reported.
     """
     if best.score < needed:
-        alike = next((one for one in rivals if _are_alike(best, one)), None)
+        alike = next((rival for rival in rivals if _are_alike(best, rival)), None)
         return alike or (rivals[0] if rivals and _stand_out(best, rivals[0], listed[2:], needed) else None)
-    return next((one for one in rivals if _against(best, [one], needed).score < needed), None)
+    return next((rival for rival in rivals if _against(best, [rival], needed).score < needed), None)
 
 
 def _are_alike(best: Place, rival: Place) -> bool:
@@ -200,7 +200,7 @@ def _two_places(best: Place, rival: Place) -> str:
 
 def _decide_pairs(location: Location, query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
     """Report the place that the paper's method found; the method has no scores."""
-    best = next((one for one in searched if one.places), None)
+    best = next((result for result in searched if result.places), None)
     if best is None:
         return _refuse(location, query, searched, [], options)
     location = _at(location, best.places[:1], None, options)
@@ -214,16 +214,16 @@ def _refuse(
     location: Location, query: Query, searched: Sequence[Searched], listed: Sequence[Place], options: LocateOptions
 ) -> Location:
     """Describe why nothing is reported, for the reference that came nearest."""
-    nearest = next((one for one in searched if listed and listed[0].index.is_of_map(one.index)), None)
-    nearest = nearest or max(searched, key=lambda one: one.n_tried)
+    nearest = next((result for result in searched if listed and listed[0].index.is_of_map(result.index)), None)
+    nearest = nearest or max(searched, key=lambda result: result.n_tried)
     code, reason = _why_nothing(query, nearest, listed, options)
     if listed:
         runner_up = next((place for place in listed[1:] if _was_compared(place, searched)), None)
         location = _at(location, listed, runner_up, options)
-    names = list(dict.fromkeys(one.index.name for one in searched))  # shards bear the name of their map
-    owed = dict.fromkeys(str(one.index.meta.get("attribution") or "") for one in searched)
+    names = list(dict.fromkeys(result.index.name for result in searched))  # shards bear the name of their map
+    owed = dict.fromkeys(str(result.index.meta.get("attribution") or "") for result in searched)
     if len(names) > 1:
-        n_ended = len(names) - len({one.index.name for one in searched if one.stopped != "exhausted"})
+        n_ended = len(names) - len({result.index.name for result in searched if result.stopped != "exhausted"})
         done = f"{n_ended} of {len(names)} maps searched to the end"
         reason = f"{reason} (looked on {', '.join(names)}; {done})"
     return replace(
@@ -237,21 +237,21 @@ def _refuse(
 
 def _fits_elsewhere(location: Location, listed: Sequence[Place], options: LocateOptions) -> Location:
     """Refuse what hints led to: the first of the places, which they exclude, explains more."""
-    better, *told = listed
-    where = f"{_away(better.apart_m(told[0]))} away" if told else "elsewhere"
+    better, *hinted = listed
+    where = f"{_away(better.apart_m(hinted[0]))} away" if hinted else "elsewhere"
     ways = broken_hints(better, options)
     reason = f"the roads fit better {where}, {', and '.join(ways)}" if ways else f"the roads fit better {where}"
     return replace(_at(location, listed, None, options), reason=reason, reason_code=Reason.FITS_ELSEWHERE)
 
 
 def _away(metres: float) -> str:
-    """Say how far, in metres or kilometres."""
+    """Write a distance, in metres or kilometres."""
     return f"{metres:.0f} m" if metres < 1000.0 else f"{metres / 1000.0:.1f} km"
 
 
 def _was_compared(place: Place, searched: Sequence[Searched]) -> bool:
     """Return whether an answer rests on a place; others are only listed."""
-    return any(_is_at(place, other) for one in searched for other in one.compared)
+    return any(_is_at(place, other) for result in searched for other in result.compared)
 
 
 def _why_nothing(
@@ -269,14 +269,14 @@ def _why_nothing(
     score = listed[0].score if listed else -math.inf
     best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if nearest.stopped == "work":
-        told = f"stopped after as much work as a search may take; of the places tried, {best}{within}"
-        return Reason.TIME_LIMIT, f"{told}; {_how_far(query, nearest, options)}"
+        stopped = f"stopped after as much work as a search may take; of the places tried, {best}{within}"
+        return Reason.TIME_LIMIT, f"{stopped}; {_how_far(query, nearest, options)}"
     if nearest.stopped == "time":
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
         stopped = f"time limit of {limit:g} s reached{tracing}, {_CUT_SHORT}"
-        told = f"{stopped}; of the places tried, {best}{within}; {_how_far(query, nearest, options)}"
-        return Reason.TIME_LIMIT, told
+        sentence = f"{stopped}; of the places tried, {best}{within}; {_how_far(query, nearest, options)}"
+        return Reason.TIME_LIMIT, sentence
     return (
         Reason.NOTHING_STANDS_OUT,
         f"no place on this map stands out: {best}{within}; {_what_may_help(query, listed, options)}",
@@ -286,10 +286,10 @@ def _why_nothing(
 def _what_may_help(query: Query, listed: Sequence[Place], options: LocateOptions) -> str:
     """List what may decide: more to see, and the missing hints, with the number of listed places that each leaves."""
     camera, usual = options.match.camera, CameraOptions()
-    views = [pose(one.matrix, query.scene.size) for one in listed]
+    views = [pose(place.matrix, query.scene.size) for place in listed]
     turned = [abs((view.rotation_deg - views[0].rotation_deg + 180.0) % 360.0 - 180.0) for view in views]
     scaled = [abs(math.log(view.gsd_m / views[0].gsd_m)) for view in views]
-    away = [listed[0].apart_m(one) for one in listed]
+    away = [listed[0].apart_m(place) for place in listed]
     place_lacks = options.near is None and options.match.within is None
     hints = (
         (camera.gsd_m == usual.gsd_m, "the size of a pixel", "5 %", "(--gsd SIZE+-5%)", scaled, math.log(1.05)),

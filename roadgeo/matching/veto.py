@@ -1,7 +1,7 @@
-"""Hints leave few rivals, or none: what they leave proves nothing. The query is searched without them, too.
+"""Hints leave few rivals, or none: a place found with them proves nothing. The query is searched without them, too.
 
-A place that was told stands only if no other place explains more, by traced roads. On 98 told masks and photographs, 19
-with false hints and 79 with true ones, that refused 18 of the 19 and none of the 79.
+A hinted place stands only if no other place explains more, by traced roads. On 98 masks and photographs with hints, 19
+false and 79 true, that refused 18 of the 19 and none of the 79.
 """
 
 from __future__ import annotations
@@ -24,81 +24,84 @@ from roadgeo.matching.scene import Query
 
 __all__ = ["broken_hints", "contest", "without_hints"]
 
-#: A place at the told one is another place if it is turned by more, or larger or smaller by this factor.
+#: A place at the hinted one is another place if it is turned by more, or larger or smaller by this factor.
 _TURNED_DEG, _SCALED = 45.0, 1.25
 #: Another place explains more if its log10 likelihood is greater by this. Where streets repeat, places are equal but
-#: for the accuracy of tracing, and a hint is what tells them apart: a true one must not lose to the roads' noise.
+#: for the accuracy of tracing, and it is a hint that separates them: a true one must not lose to the roads' noise.
 _MORE = 0.5
-#: Limit of work for a search without hints where the told one found nothing that would be reported, seconds.
+#: Limit of work for a search without hints where the one with hints found nothing that would be reported, seconds.
 _BRIEFLY_S = 1.0
 
 
 def without_hints(options: LocateOptions) -> LocateOptions | None:
     """Return the options without hints on the place, the heading and the scale; None where none are given."""
     camera, usual = options.match.camera, CameraOptions().gsd_m
-    told_scale = camera.gsd_m[1] / camera.gsd_m[0] < 0.999 * usual[1] / usual[0]
-    if options.near is None and options.match.within is None and camera.heading is None and not told_scale:
+    is_scale_given = camera.gsd_m[1] / camera.gsd_m[0] < 0.999 * usual[1] / usual[0]
+    if options.near is None and options.match.within is None and camera.heading is None and not is_scale_given:
         return None
-    camera = replace(camera, heading_deg=None, north_up=False, gsd_m=usual if told_scale else camera.gsd_m)
+    camera = replace(camera, heading_deg=None, north_up=False, gsd_m=usual if is_scale_given else camera.gsd_m)
     return replace(options, near=None, match=replace(options.match, camera=camera, within=None))
 
 
 def contest(
-    query: Query, told: Sequence[Searched], parts: Sequence[Part], options: LocateOptions, time_limit_s: float
+    query: Query, hinted: Sequence[Searched], parts: Sequence[Part], options: LocateOptions, time_limit_s: float
 ) -> list[Searched]:
     """Return what a search with hints found; with the place where the roads fit better without them, if there is one.
 
-    Where the told search found a place that would be reported, any other place that explains more is a better one.
+    Where the search with hints found a place that would be reported, any other that explains more is a better one.
     Where it did not, only a place that would be reported itself is. A better place that agrees with the hints is the
-    answer: what was found without them.
+    answer: the places found without them.
     """
     free, needed = without_hints(options), options.min_log10_odds
-    leading = max(told, key=lambda one: one.places[0].score if one.places else -math.inf)
+    leading = max(hinted, key=lambda result: result.places[0].score if result.places else -math.inf)
     if free is None or leading.n_searched == 0 or options.method == "pair":
-        return list(told)
-    is_told = bool(leading.places) and leading.places[0].score >= needed
-    if not is_told:
+        return list(hinted)
+    is_reported = bool(leading.places) and leading.places[0].score >= needed
+    if not is_reported:
         brief = replace(free.search, work_limit_s=min(_BRIEFLY_S, free.search.work_limit_s))
         free = replace(free, effort="quick", search=brief)
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
     found = search_references(query, here, free, time_limit_s)
-    others = [place for one in found for place in (one.likeliest if is_told else one.places[:1])]
-    if not is_told:
+    others = [place for result in found for place in (result.likeliest if is_reported else result.places[:1])]
+    if not is_reported:
         others = [place for place in others if place.score >= needed]
     better = _better(leading.places[0] if leading.places else None, others)
     if better is not None and not broken_hints(better, options):  # hints led past it
         return found
-    spent_s = sum(one.match_s + one.refine_s for one in found)
-    return [replace(one, better=better, match_s=one.match_s + spent_s) if one is leading else one for one in told]
+    spent_s = sum(result.match_s + result.refine_s for result in found)
+    return [
+        replace(result, better=better, match_s=result.match_s + spent_s) if result is leading else result
+        for result in hinted
+    ]
 
 
-def _better(told: Place | None, others: Sequence[Place]) -> Place | None:
-    """Return the other place that explains most, if it explains more than the told one, at the told one's scale."""
-    if told is None:
+def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:
+    """Return the other place that explains most, if it explains more than the hinted one, at that one's scale."""
+    if hinted is None:
         return max(others, key=lambda place: place.explained, default=None)
     weighed = [
-        (Evidence(told.scene, place.index, told.gsd_m).weigh(place.matrix), place)
+        (Evidence(hinted.scene, place.index, hinted.gsd_m).weigh(place.matrix), place)
         for place in others
-        if _is_other(told, place)
+        if _is_other(hinted, place)
     ]
     worth, best = max(weighed, key=lambda pair: pair[0], default=(-math.inf, None))
-    own = told.agreement.log10_likelihood
+    own = hinted.agreement.log10_likelihood
     if best is None or worth < own + _MORE:
         return None
-    return best.but(score=worth - own, by=Weight(worth, told.but(by=None).statement_px))
+    return best.but(score=worth - own, by=Weight(worth, hinted.but(by=None).statement_px))
 
 
-def _is_other(told: Place, place: Place) -> bool:
-    """Return whether a place is another than the told one: elsewhere, turned, or of another size."""
-    size = told.scene.size
-    turn = pose(told.matrix, size).rotation_deg - pose(place.matrix, size).rotation_deg
+def _is_other(hinted: Place, place: Place) -> bool:
+    """Return whether a place is another than the hinted one: elsewhere, turned, or of another size."""
+    size = hinted.scene.size
+    turn = pose(hinted.matrix, size).rotation_deg - pose(place.matrix, size).rotation_deg
     is_turned = abs((turn + 180.0) % 360.0 - 180.0) > _TURNED_DEG
-    return is_turned or abs(math.log(place.gsd_m / told.gsd_m)) > math.log(_SCALED) or not place.same(told)
+    return is_turned or abs(math.log(place.gsd_m / hinted.gsd_m)) > math.log(_SCALED) or not place.same(hinted)
 
 
 def broken_hints(place: Place, options: LocateOptions) -> list[str]:
-    """Return in which ways a place is not as the hints say, each with what to leave out."""
+    """Return in which ways a place contradicts the hints, each with the hint to leave out."""
     camera, near, within = options.match.camera, options.near, options.match.within
     lon, lat = place.lonlat.tolist()
     ways = []
