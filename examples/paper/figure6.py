@@ -37,7 +37,7 @@ def main() -> None:
     if "auto" in options.methods:
         default = LocateOptions()
         search = replace(default.search, time_limit_s=options.time_limit)
-        anything = replace(default, min_log10_odds=min(ODDS), min_margin=0.0, search=search)
+        anything = replace(default, min_log10_odds=min(ODDS), search=search)
         done, _ = paper.trials(queries, paper.AutoLocator(area, anything), options, "auto, any odds")
         for odds in ODDS:
             cut = [

@@ -217,32 +217,28 @@ def _open(key: tuple[Path, ...], locator: ReferenceLocator) -> Callable[[Mask], 
 
 @dataclass(frozen=True)
 class Row:
-    """The outcome of one search: the kind of its mask, the best score, its lead, and whether the place was right."""
+    """The outcome of one search: the kind of its mask, the best score, and whether the place was right."""
 
     city: str
     seed: int
     kind: str
     worn: str
     score: float
-    lead: float
     right: bool
     seconds: float
 
-    def reported(self, threshold: float, margin: float) -> bool:
+    def reported(self, threshold: float) -> bool:
         """Whether the place would be reported with this threshold."""
-        return self.score >= threshold and self.lead >= margin
+        return self.score >= threshold
 
 
 def row_of(city: str, seed: int, kind: str, trial: Trial) -> Row:
     found: Score = score(trial.truth, trial.answer)
-    rival = (trial.answer.get("runner_up") or {}).get("log10_odds")
     best = found.log10_odds if math.isfinite(found.log10_odds) else -math.inf
-    lead = math.inf if rival is None else best - rival
-    asked = LocateOptions()
-    if found.status != "located" and best >= asked.min_log10_odds and lead >= asked.min_margin:
+    if found.status != "located" and best >= LocateOptions().min_log10_odds:
         best = -math.inf  # refused for another reason, as half a place: it is reported at no threshold
     seconds = sum(found.seconds.get(step, 0.0) for step in ("match", "refine"))
-    return Row(city, seed, kind, trial.truth.kind.split("_")[-1], best, lead, found.right, seconds)
+    return Row(city, seed, kind, trial.truth.kind.split("_")[-1], best, found.right, seconds)
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -251,20 +247,18 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
         writer = csv.writer(file)
         writer.writerow([f.name for f in fields(Row)])
         for r in rows:
-            numbers = (f"{r.score:.2f}", f"{r.lead:.2f}", int(r.right), f"{r.seconds:.2f}")
+            numbers = (f"{r.score:.2f}", int(r.right), f"{r.seconds:.2f}")
             writer.writerow([r.city, r.seed, r.kind, r.worn, *numbers])
 
 
 def read_rows(path: Path) -> list[Row]:
     """Read what `write_rows` wrote."""
     with path.open(newline="", encoding="utf-8") as file:
+        next(file)
         return [
-            Row(
-                r["city"], int(r["seed"]), r["kind"], r["worn"], float(r["score"]), float(r["lead"]),
-                r["right"] == "1", float(r["seconds"]),
-            )
-            for r in csv.DictReader(file)
-        ]  # fmt: skip
+            Row(city, int(seed), kind, worn, float(best), right == "1", float(seconds))
+            for city, seed, kind, worn, best, right, seconds in csv.reader(file)
+        ]
 
 
 def bounds(hits: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -284,32 +278,32 @@ def percent(hits: int, of: int) -> str:
     return f"{hits} of {of}: {100 * hits / of:.2f} % ({100 * low:.2f}-{100 * high:.2f})"
 
 
-def threshold_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
+def threshold_table(rows: Sequence[Row], least: float) -> list[list[str]]:
     """List for each threshold the places reported; below the usual one it is unknown which were right."""
     there, nowhere = [r for r in rows if r.kind == "there"], [r for r in rows if r.kind != "there"]
     table = [["score at least", "with a place: right", "with a place: wrong", "without a place: wrong"]]
     for threshold in THRESHOLDS:
-        wrong = sum(r.reported(threshold, margin) for r in nowhere)
+        wrong = sum(r.reported(threshold) for r in nowhere)
         cells = ["-", "-"]
         if threshold >= least:
-            found = [r.right for r in there if r.reported(threshold, margin)]
+            found = [r.right for r in there if r.reported(threshold)]
             cells = [percent(sum(found), len(there)), percent(len(found) - sum(found), len(there))]
         table.append([f"{threshold:g}", *cells, percent(wrong, len(nowhere))])
     return table
 
 
-def band_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
+def band_table(rows: Sequence[Row], least: float) -> list[list[str]]:
     """List for each band of `ERROR_RATES`, which results state, the share of wrong places."""
     table = [["score", "reported", "wrong"]]
     edges = [least, *(rate.score for rate in ERROR_RATES if rate.score > least)]
     for low, high in zip(edges, [*edges[1:], math.inf], strict=True):
-        inside = [r for r in rows if low <= r.score < high and r.lead >= margin]
+        inside = [r for r in rows if low <= r.score < high]
         name = f"{low:g} to {high:g}" if high < math.inf else f"{low:g} and more"
         table.append([name, str(len(inside)), percent(sum(not r.right for r in inside), len(inside))])
     return table
 
 
-def kind_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
+def kind_table(rows: Sequence[Row], least: float) -> list[list[str]]:
     """List the outcome of each kind and wear."""
     table = [["mask", *WORN, "highest score without a place", "match + refine s, median / 95 %"]]
     for kind in KINDS:
@@ -319,7 +313,7 @@ def kind_table(rows: Sequence[Row], least: float, margin: float) -> list[list[st
         cells = []
         for worn in WORN:
             mine = [r for r in some if r.worn == worn]
-            cells.append(f"{sum(r.reported(least, margin) for r in mine)} of {len(mine)}")
+            cells.append(f"{sum(r.reported(least) for r in mine)} of {len(mine)}")
         highest = "" if kind == "there" else f"{max(r.score for r in some):.1f}"
         spent = np.nanquantile([r.seconds for r in some], [0.5, 0.95])
         table.append([kind, *cells, highest, f"{spent[0]:.2f} / {spent[1]:.2f}"])
@@ -365,12 +359,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = [row_of(city, options.seed, kind, trial) for city, kind, ran in found for trial in ran]
     write_rows(options.out / f"{options.effort}.csv", rows)
     rows += [row for path in options.add for row in read_rows(path)]
-    usual = LocateOptions()
-    least, margin = usual.min_log10_odds, usual.min_margin
+    least = LocateOptions().min_log10_odds
     n = sum(r.kind != "there" for r in rows)
     n_maps = len({r.city for r in rows})
     head = f"{len(rows)} searches with {options.effort} effort on {n_maps} maps, {n} of masks without a place"
-    tables = (threshold_table(rows, least, margin), band_table(rows, least, margin), kind_table(rows, least, margin))
+    tables = (threshold_table(rows, least), band_table(rows, least), kind_table(rows, least))
     text = "\n\n".join([head, *map(render, tables)])
     print(text)
     (options.out / f"{options.effort}.md").write_text(text + "\n", encoding="utf-8")

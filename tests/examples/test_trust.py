@@ -32,38 +32,37 @@ def test_bounds_are_those_of_clopper_and_pearson(trust):
 
 def test_rows_are_counted_by_threshold_band_and_kind(trust):
     rows = [
-        trust.Row("porto", 1, "there", "mild", 20.0, np.inf, True, 0.1),
-        trust.Row("porto", 1, "there", "few", 5.5, 1.0, False, 0.1),  # ambiguous: the lead is too short
-        trust.Row("porto", 1, "there", "noisy", 4.2, 3.0, False, 0.1),
-        trust.Row("porto", 1, "elsewhere", "mild", 3.7, 2.5, False, 0.1),
-        trust.Row("porto", 1, "mirrored", "torn", 2.1, np.inf, False, 0.1),
+        trust.Row("porto", 1, "there", "mild", 20.0, True, 0.1),
+        trust.Row("porto", 1, "there", "few", -np.inf, False, 0.1),  # ambiguous
+        trust.Row("porto", 1, "there", "noisy", 4.2, False, 0.1),
+        trust.Row("porto", 1, "elsewhere", "mild", 3.7, False, 0.1),
+        trust.Row("porto", 1, "mirrored", "torn", 2.1, False, 0.1),
     ]
-    reported = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5, 2.0)}
+    reported = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5)}
     assert reported["2"][:2] == ["-", "-"]
     assert reported["2"][2].startswith("2 of 2")
     assert [cell.split(":")[0] for cell in reported["3.5"]] == ["1 of 3", "1 of 3", "1 of 2"]
     assert [cell.split(":")[0] for cell in reported["5"]] == ["1 of 3", "0 of 3", "0 of 2"]
-    bands = {row[0]: row[1:] for row in trust.band_table(rows, 3.5, 2.0)}
+    bands = {row[0]: row[1:] for row in trust.band_table(rows, 3.5)}
     assert bands["3.5 to 5"][0] == "2"
     assert bands["3.5 to 5"][1].startswith("2 of 2")
     assert bands["5 to 8"][0] == "0"
-    kinds = {row[0]: row for row in trust.kind_table(rows, 3.5, 2.0)}
+    kinds = {row[0]: row for row in trust.kind_table(rows, 3.5)}
     assert kinds["elsewhere"][-2] == "3.7"
 
 
 @pytest.mark.parametrize(("status", "score"), [("located", 5.5), ("ambiguous", -np.inf)])
 def test_half_a_place_is_reported_at_no_threshold(trust, status, score):
     truth = Truth("a.png", "there_few", np.eye(3), None, (100, 100))
-    answer = {"status": status, "log10_odds": 5.5, "runner_up": {"log10_odds": -5.5}}
+    answer = {"status": status, "log10_odds": 5.5}
     assert trust.row_of("porto", 1, "there", trust.Trial(truth, answer)).score == score
 
 
 def test_the_error_rates_that_results_state_are_those_counted(trust):
-    margin = LocateOptions().min_margin
     rows = [row for path in sorted((TRUST.parent / "results").glob("*.csv")) for row in trust.read_rows(path)]
     highest = [rate.score for rate in ERROR_RATES[1:]] + [np.inf]
     for rate, end in zip(ERROR_RATES, highest, strict=True):
-        found = [row for row in rows if row.reported(rate.score, margin) and row.score < end]
+        found = [row for row in rows if row.reported(rate.score) and row.score < end]
         wrong = sum(not row.right for row in found)
         assert (rate.reported, rate.wrong) == (len(found), wrong)
         assert rate.at_most == pytest.approx(trust.bounds(wrong, len(found))[1], abs=5e-4)
@@ -72,8 +71,8 @@ def test_the_error_rates_that_results_state_are_those_counted(trust):
 
 def test_rows_come_back_from_their_file(trust, tmp_path):
     rows = [
-        trust.Row("porto", 1, "there", "mild", 20.25, np.inf, True, 0.5),
-        trust.Row("chicago", 2, "mirrored", "torn", -np.inf, np.inf, False, 1.25),
+        trust.Row("porto", 1, "there", "mild", 20.25, True, 0.5),
+        trust.Row("chicago", 2, "mirrored", "torn", -np.inf, False, 1.25),
     ]
     trust.write_rows(tmp_path / "quick.csv", rows)
     assert trust.read_rows(tmp_path / "quick.csv") == rows
