@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from functools import partial
 
 import click
 
@@ -26,7 +27,9 @@ def keep_switch(context: click.Context, parameter: click.Parameter, given: bool)
     """Keep a switch of the command that runs for all that prints, as click calls back; --quiet for the log, too."""
     context.meta[f"roadgeo.{parameter.name}"] = given
     if parameter.name == "quiet":
-        logging.getLogger("roadgeo").setLevel(logging.ERROR if given else logging.WARNING)
+        log = logging.getLogger("roadgeo")
+        context.call_on_close(partial(log.setLevel, log.level))  # a program may run commands, and go on
+        log.setLevel(logging.ERROR if given else logging.WARNING)
 
 
 def is_set(switch: str) -> bool:

@@ -276,8 +276,7 @@ def _listed(estimator: TripleEstimator, best: Place, needed: float) -> tuple[Pla
     """Return the likeliest place, its corners measured, and others that were verified; all by one yardstick.
 
     Likelihoods are those by the picture where there is a soft one, so that places on several maps compare by it. Other
-    places score what they explain less than the best, but no more than the best leads. Where the best is not `needed`
-    ahead the corners of all are measured.
+    places have the score of `less_than`. Where the best is not `needed` ahead the corners of all are measured.
     """
     counted_px = best.statement_px
     best = measure_corners(estimator, best.but(by=Weight(best.log10_likelihood, counted_px)))
@@ -292,7 +291,7 @@ def _listed(estimator: TripleEstimator, best: Place, needed: float) -> tuple[Pla
         rival = rival and by_picture(rival, best.gsd_m)
     if rival is not None:
         behind = 0.0 if estimator.scene.probability is None else rival.log10_likelihood - best.log10_likelihood
-        rival = rival.but(score=min(behind, -best.score, 0.0))
+        rival = rival.but(score=min(behind, -abs(best.score)))
     others = [less_than(best, place) for place in others]
     if best.score < needed:  # the user may take any of them
         rival, others = rival and measured(estimator, rival), [measured(estimator, place) for place in others]
@@ -300,8 +299,8 @@ def _listed(estimator: TripleEstimator, best: Place, needed: float) -> tuple[Pla
 
 
 def less_than(best: Place, place: Place) -> Place:
-    """Return a place with its score against the best: what it explains less, but no more than the best leads."""
-    return place.but(score=min(place.log10_likelihood - best.log10_likelihood, -best.score, 0.0))
+    """Return a place with its score: what it explains less than the best, and no more than the best scores or leads."""
+    return place.but(score=min(place.log10_likelihood - best.log10_likelihood, -abs(best.score)))
 
 
 def _of_effort(options: LocateOptions) -> MatchOptions:

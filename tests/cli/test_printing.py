@@ -1,6 +1,7 @@
 """Names of files and of references, and what files say, are shown on a terminal, not obeyed by it."""
 
 import json
+import logging
 import os
 import sqlite3
 from pathlib import Path
@@ -34,6 +35,15 @@ def test_our_own_colours_and_lines_stay_and_no_others(capsys: pytest.CaptureFixt
     echo(text, color=True)
     assert capsys.readouterr().out == "\x1b[31mError:\x1b[0m one\n  \\x1b[31mtwo \\x1b[8m hidden\n"
     assert plain(text) == "Error: one\n  \x1b[31mtwo \x1b[8m hidden"
+
+
+@pytest.mark.parametrize("switch", ["-q", "-v"])
+def test_the_log_is_as_quiet_after_a_command_as_before(switch: str, tmp_path: Path) -> None:
+    """A program that ran a command with -q had no warnings any more."""
+    log = logging.getLogger("roadgeo")
+    before = log.level
+    assert main(["index", "--roads", str(write_streets(tmp_path / "streets.gpkg")), switch]) == 0
+    assert log.level == before
 
 
 @pytest.mark.parametrize("name", [f"[bold]{ESCAPES}.png", os.fsdecode(b"caf\xe9\n.png")])
