@@ -11,6 +11,7 @@ from shapely import LineString
 from worlds.scenes import PLANE, camera, look, mapped, random_network
 
 from roadgeo.cli import main
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
@@ -23,6 +24,7 @@ from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.explanation_sheet import STARVED, draw_explanation, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
+from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.network import build_network
 from roadgeo.workflows import LocateOptions, explain, locate
@@ -155,6 +157,18 @@ def test_a_mask_of_elsewhere(town):
     assert search["starved_at"] in {"odds", "survived", "on_roads", "camera"}
     assert search["stopped"] == "exhausted"
     assert all(place["why"] != "located" for place in search["places"])
+
+
+@pytest.mark.slow
+def test_places_of_a_refusal_come_in_the_order_of_its_list(porto):
+    """Users take a place by its number: the picture must show the one that they take."""
+    elsewhere = next(mask.path for mask in demo_masks() if mask.path.stem == "elsewhere")
+    explained = explain(elsewhere, open_reference(porto))
+    listed = [(place.center.lon, place.center.lat) for place in explained.location.places]
+    assert not explained.location.located
+    assert len(listed) > 1
+    shown = [place.place.lonlat for place in explained.stories[0].places]
+    np.testing.assert_allclose(shown[: len(listed)], listed[: len(shown)], atol=1e-6)
 
 
 @pytest.mark.slow
