@@ -20,7 +20,7 @@ import click
 
 from roadgeo._version import __version__
 from roadgeo.cli.fencing import OWN_PROCESS
-from roadgeo.cli.printing import complain, echo
+from roadgeo.cli.printing import complain, echo, own_log
 from roadgeo.errors import RoadgeoError, is_of_memory, name_package
 from roadgeo.storage.fence import remedy
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
@@ -149,6 +149,7 @@ def _terminate(number: int, frame: FrameType | None) -> Any:
     signal.default_int_handler(number, frame)
 
 
+@own_log()
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
     if arguments is None:  # the process is ours

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import os
 import re
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import click
 
 from roadgeo._text import visible
 
-__all__ = ["complain", "echo", "is_set", "keep_switch", "paint", "plain", "tell"]
+__all__ = ["complain", "echo", "is_set", "keep_switch", "own_log", "paint", "plain", "tell"]
 
+_LOG = logging.getLogger("roadgeo")
 #: Stands for the escape character in what `paint` returns: no name of a file can hold it.
 _MARK = f"\ufdd0{os.urandom(8).hex()}"
 
@@ -27,9 +29,17 @@ def keep_switch(context: click.Context, parameter: click.Parameter, given: bool)
     """Keep a switch of the command that runs for all that prints, as click calls back; --quiet for the log, too."""
     context.meta[f"roadgeo.{parameter.name}"] = given
     if parameter.name == "quiet":
-        log = logging.getLogger("roadgeo")
-        context.call_on_close(partial(log.setLevel, log.level))  # a program may run commands, and go on
-        log.setLevel(logging.ERROR if given else logging.WARNING)
+        _LOG.setLevel(logging.ERROR if given else logging.WARNING)
+
+
+@contextmanager
+def own_log() -> Iterator[None]:
+    """End what a command sets of the log with it: a program may run commands, and go on."""
+    before = _LOG.level
+    try:
+        yield
+    finally:
+        _LOG.setLevel(before)
 
 
 def is_set(switch: str) -> bool:

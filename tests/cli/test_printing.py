@@ -37,12 +37,14 @@ def test_our_own_colours_and_lines_stay_and_no_others(capsys: pytest.CaptureFixt
     assert plain(text) == "Error: one\n  \x1b[31mtwo \x1b[8m hidden"
 
 
-@pytest.mark.parametrize("switch", ["-q", "-v"])
-def test_the_log_is_as_quiet_after_a_command_as_before(switch: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("others", "status"), [(["-q"], 0), (["-v"], 0), (["-q", "--no-such"], 2), (["-q", "--memory", "x"], 2)]
+)
+def test_the_log_is_as_quiet_after_a_command_as_before(others: list[str], status: int, tmp_path: Path) -> None:
     """A program that ran a command with -q had no warnings any more."""
     log = logging.getLogger("roadgeo")
     before = log.level
-    assert main(["index", "--roads", str(write_streets(tmp_path / "streets.gpkg")), switch]) == 0
+    assert main(["index", "--roads", str(write_streets(tmp_path / "streets.gpkg")), *others]) == status
     assert log.level == before
 
 
