@@ -24,6 +24,7 @@ from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.tasks import Task
 from roadgeo.storage.fence import remedy
+from roadgeo.storage.rasters import require_there
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
@@ -235,6 +236,7 @@ class Locating:
         except MaskError:
             answer = None
         if answer is None or answer.query != task.query or not answer.places or taken is None:
+            require_there(task.mask)
             _LOG.warning("%s: no earlier answer lies in %s: searching first", visible(task.query), self.out_dir)
             return None
         kept = probability_path(paths)

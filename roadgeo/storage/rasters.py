@@ -48,6 +48,7 @@ __all__ = [
     "raster_size",
     "read_palette",
     "require_file",
+    "require_there",
     "sidecar_nodata",
     "writing_raster",
 ]
@@ -213,6 +214,13 @@ def _doubt(reason: str, path: Path) -> str:
     if re.search(r"\bwrit|space|quota|file too large", reason, re.IGNORECASE):
         return "; is the disk full?"
     return ""
+
+
+def require_there(path: str) -> None:
+    """Raise `MaskError` where the file of a picture, or of a page of one, is missing; what is remote may be there."""
+    page = _PAGE.fullmatch(path)
+    if not is_named_remote(path):
+        require_file(page[2] if page else path, path)
 
 
 def require_file(path: str | os.PathLike[str], name: str) -> None:

@@ -107,6 +107,12 @@ def test_without_an_answer_it_is_searched_first_which_is_said(porto, caplog):
     assert "no earlier answer lies in .: searching first" in caplog.text
 
 
+def test_a_missing_image_is_no_reason_to_search(porto, caplog, capfd):
+    assert main(["locate", "missing.png", "-r", str(porto), "--take", "2"]) == 1
+    assert "missing.png: no such file" in capfd.readouterr().err
+    assert "searching first" not in caplog.text
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "1.5", "nowhere", "200,10", "1,2,3"])
 def test_what_is_no_place_is_a_usage_error(text, porto, capfd):
     assert main([*LOCATE, "-r", str(porto), "--take", text]) == 2
