@@ -25,7 +25,7 @@ from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import Reference
 
-__all__ = ["Candidates", "Look"]
+__all__ = ["Candidates", "MosaicQuery"]
 
 
 #: Places that explain most: they are weighed again with the frames to come.
@@ -33,7 +33,7 @@ MOST = 60
 
 
 @dataclass(frozen=True)
-class Look:
+class MosaicQuery:
     """Frames laid together, and which they are.
 
     Attributes
@@ -69,9 +69,9 @@ class _Candidate:
     seen_at: int
     log10_likelihood: float
 
-    def under(self, look: Look) -> FloatArray:
+    def under(self, frames: MosaicQuery) -> FloatArray:
         """Return where it puts the mosaic, query plane to reference plane."""
-        to_mosaic = look.mosaic.to_mosaic[list(look.numbers).index(self.seen_at)]
+        to_mosaic = frames.mosaic.to_mosaic[list(frames.numbers).index(self.seen_at)]
         matrix = self.matrix @ np.linalg.inv(to_mosaic) @ PIXEL_TO_PLANE
         return np.asarray(matrix / matrix[2, 2])
 
@@ -82,45 +82,45 @@ class Candidates:
 
     Attributes
     ----------
-    n_looks : int
+    n_searches : int
         Searches of the map until now: each takes its share off the odds.
     """
 
     references: Sequence[Reference]
-    n_looks: int = 0
+    n_searches: int = 0
     _kept: list[_Candidate] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self._kept)
 
-    def look(self, look: Look, options: LocateOptions) -> Location:
+    def decide(self, frames: MosaicQuery, options: LocateOptions) -> Location:
         """Weigh what was proposed, search the map where that is due, and judge both together."""
-        self.n_looks += look.searched
-        if look.searched and options.effort == "full":
+        self.n_searches += frames.searched
+        if frames.searched and options.effort == "full":
             # A quick search proposes the place nearly as often, in a tenth of the time: it will do where that leads.
-            location = self._search(look, replace(options, effort="quick"))
+            location = self._search(frames, replace(options, effort="quick"))
             if location.located:
                 return location
-        return self._search(look, options)
+        return self._search(frames, options)
 
-    def _search(self, look: Look, options: LocateOptions) -> Location:
+    def _search(self, frames: MosaicQuery, options: LocateOptions) -> Location:
         """Search the map where that is due; places that were proposed before are among those that the search meets."""
-        if not look.searched:
+        if not frames.searched:
             options = replace(options, match=replace(options.match, sweeps=(), without_roads=(), roads=False))
         proposed: list[Proposed] = [
-            (kept.index, kept.under(look)) for kept in self._kept if kept.seen_at in look.numbers
+            (kept.index, kept.under(frames)) for kept in self._kept if kept.seen_at in frames.numbers
         ]
         parts = [part for reference in self.references for part in reference.parts]
         found = search_references(
-            look.query, parts, options, options.search.time_limit_s, explained=True, proposed=proposed
+            frames.query, parts, options, options.search.time_limit_s, explained=True, proposed=proposed
         )
-        kept = [candidate for result in found for candidate in _proposed(result, look)]
+        kept = [candidate for result in found for candidate in _proposed(result, frames)]
         self._kept = sorted(kept, key=lambda kept: -kept.log10_likelihood)[:MOST]
-        paid = math.log10(max(self.n_looks, 1))  # each search may find a place by chance
-        return decide(look.query, [result.less_likely(paid) for result in found], options)
+        paid = math.log10(max(self.n_searches, 1))  # each search may find a place by chance
+        return decide(frames.query, [result.less_likely(paid) for result in found], options)
 
 
-def _proposed(searched: Searched, look: Look) -> Iterable[_Candidate]:
+def _proposed(searched: Searched, frames: MosaicQuery) -> Iterable[_Candidate]:
     """Yield the likeliest places that a search compared with the map."""
     best: list[Place] = []
     if searched.estimator is None:
@@ -128,5 +128,5 @@ def _proposed(searched: Searched, look: Look) -> Iterable[_Candidate]:
     for place in sorted(searched.estimator.verified, key=lambda place: -place.log10_likelihood):
         if len(best) < MOST and not any(place.same(known) for known in best):
             best.append(place)
-            matrix = place.matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
-            yield _Candidate(searched.index, matrix, look.numbers[-1], place.log10_likelihood)
+            matrix = place.matrix @ PIXEL_TO_PLANE @ frames.mosaic.to_mosaic[-1]
+            yield _Candidate(searched.index, matrix, frames.numbers[-1], place.log10_likelihood)

@@ -112,7 +112,7 @@ class _Net:
         mosaic = lay_down(masks, self.matrices[list(chosen)], road_px(masks))
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
-        options = tracker.look_options(mosaic, masks)
+        options = tracker.search_options(mosaic, masks)
         paid = math.log10(1 + len(self.frames))  # one search each: any could agree by chance
         location = locate(
             mosaic.mask, references, replace(options, min_log10_odds=round(options.min_log10_odds + paid, 1))

@@ -17,7 +17,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
-from roadgeo.flights.candidates import Candidates, Look
+from roadgeo.flights.candidates import Candidates, MosaicQuery
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
 from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions, sampling
@@ -233,7 +233,7 @@ class Tracker:
 
     def _forget(self) -> None:
         """Forget what earlier frames proposed."""
-        self._looked_at = self._waited = 0
+        self._searched_at = self._waited = 0
         self._candidates = Candidates(self.references)
 
     # --- searching ----------------------------------------------------------------------------------------------------
@@ -253,23 +253,23 @@ class Tracker:
             return [Tracked(frame, "lost", "no camera moves like this; begun anew", frame.number)]
         query = _read(mosaic)
         n_seen = 0 if query is None else len(query.scene.intersections)
-        least = max(_FEWEST, self._looked_at + _MORE)
+        least = max(_FEWEST, self._searched_at + _MORE)
         if query is None or (n_seen < least and not self._candidates):
             why = f"waits: {len(masks)} frames show {n_seen} intersections, looked for again with {least}"
             return [Tracked(frame, "lost", why, frame.number)]
         self._waited += 1
         searched = n_seen >= least or self._waited >= _MORE_FRAMES
         if searched:
-            self._looked_at, self._waited = n_seen, 0
-        look = Look(query, mosaic, [member.frame.number for member in self._window], searched)
-        location = self._candidates.look(look, self.look_options(mosaic, masks))
+            self._searched_at, self._waited = n_seen, 0
+        frames = MosaicQuery(query, mosaic, [member.frame.number for member in self._window], searched)
+        location = self._candidates.decide(frames, self.search_options(mosaic, masks))
         if not location.located:
             return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
         return self._settle(location, mosaic) or [
             Tracked(frame, "lost", "a place was found, but the frames by themselves do not agree", frame.number)
         ]
 
-    def look_options(self, mosaic: Mosaic, masks: Sequence[RoadMask]) -> LocateOptions:
+    def search_options(self, mosaic: Mosaic, masks: Sequence[RoadMask]) -> LocateOptions:
         """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from roadgeo.running.looks import Locate, Sighting
     from roadgeo.workflows import LocateOptions
 
-__all__ = ["Asked", "Locating", "Outcome", "changed_options"]
+__all__ = ["Locating", "Outcome", "Question", "changed_options"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -82,16 +82,16 @@ class Locating:
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
-        asked = self.ask()
-        return lambda task: self.do(task, asked)
+        question = self.ask()
+        return lambda task: self.do(task, question)
 
-    def ask(self) -> Asked:
+    def ask(self) -> Question:
         """Open the references, and collect the question that every mask is asked."""
         started = perf_counter()
         from roadgeo.reference.opening import open_references
 
         references = open_references(self.references)
-        return Asked(references, perf_counter() - started, self._changes())
+        return Question(references, perf_counter() - started, self._changes())
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
@@ -125,10 +125,10 @@ class Locating:
             **changed_options(self.outputs.image, usual.outputs.image),
         }
 
-    def do(self, task: Task, asked: Asked, how: Locate | None = None) -> Outcome:
+    def do(self, task: Task, question: Question, how: Locate | None = None) -> Outcome:
         """Locate one mask and write its results; the one place where what goes wrong with a mask is caught."""
         try:
-            return self.earlier(task, asked) or self._locate(task, asked, how)
+            return self.earlier(task, question) or self._locate(task, question, how)
         except RoadgeoError as error:
             return self.failed(task, error.code, str(error))
         except UnicodeEncodeError:  # libraries take no other names
@@ -147,7 +147,7 @@ class Locating:
             reason = f"{task.query}: {what}; this is a fault of roadgeo, please report it"
             return self.failed(task, Reason.FAULT, reason)
 
-    def earlier(self, task: Task, asked: Asked) -> Outcome | None:
+    def earlier(self, task: Task, question: Question) -> Outcome | None:
         """Return the result of an earlier run, if it is whole, the answer to the same question, and younger than it.
 
         None too where results of before are not to be kept.
@@ -168,7 +168,7 @@ class Locating:
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.query):
             return None
         status, photo = document.get("status"), self.options.photo(task, is_ours(probability_path(paths)))
-        if status not in {"located", "ambiguous", "not_located", "chosen"} or not asked.same(document):
+        if status not in {"located", "ambiguous", "not_located", "chosen"} or not question.same(document):
             return None
         wanted = wanted_outputs(
             self.outputs.products, status in ("located", "chosen"), bool(photo), bool(document.get("camera"))
@@ -177,7 +177,7 @@ class Locating:
         whole = all(path.is_file() and path.stat().st_size for path in files)
         return Outcome(status, document, earlier=True) if whole else None
 
-    def _locate(self, task: Task, asked: Asked, how: Locate | None) -> Outcome:
+    def _locate(self, task: Task, question: Question, how: Locate | None) -> Outcome:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
@@ -192,9 +192,9 @@ class Locating:
         options = self.search_options(task)
         paths, reading, sighting = output_paths(self.out_dir, task.stem), self.options.reading, None
         if self.options.taken is not None:
-            sighting = self._take(task, asked, options)
+            sighting = self._take(task, question, options)
         if sighting is None:
-            sighting = locate_query(task.mask, asked.references, options, reading, how=how, say=self.say)
+            sighting = locate_query(task.mask, question.references, options, reading, how=how, say=self.say)
             if self.options.taken is not None:
                 sighting = sighting.told(take_place(sighting.location, self.options.taken, options))
         sighting = sighting.showing(stated=None if sighting.location.place is None else read_stated_middle(task.mask))
@@ -203,16 +203,16 @@ class Locating:
         spent = location.seconds
         reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine
         location = replace(
-            _on_ground(location.spending(open=asked.seconds, read=max(reading_s, 0.0)), self.options.dem),
+            _on_ground(location.spending(open=question.seconds, read=max(reading_s, 0.0)), self.options.dem),
             query=task.query,
-            options=asked.options,
+            options=question.options,
             command=self._command(task),
-            reference_digest=digest_of(asked.references, location.reference),
+            reference_digest=digest_of(question.references, location.reference),
         )
         photo = self.options.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
-        indexes = [reference.index_of(location) for reference in asked.references]
+        indexes = [reference.index_of(location) for reference in question.references]
         outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
         written = write_location(location, mask, paths, outputs, photo, indexes, explanation)
         return Outcome(
@@ -224,7 +224,7 @@ class Locating:
             faults=tuple(written.faults),
         )
 
-    def _take(self, task: Task, asked: Asked, options: LocateOptions) -> Sighting | None:
+    def _take(self, task: Task, question: Question, options: LocateOptions) -> Sighting | None:
         """Take a place of the last answer for an image; None, with a warning, where there is no such answer."""
         from roadgeo.outputs.location_document import read_answer
         from roadgeo.outputs.paths import output_paths
@@ -240,7 +240,7 @@ class Locating:
             _LOG.warning("%s: no earlier answer lies in %s: searching first", visible(task.query), self.out_dir)
             return None
         kept = probability_path(paths)
-        return take_again(answer, taken, task.mask, kept, asked.references, self.options.reading, options)
+        return take_again(answer, taken, task.mask, kept, question.references, self.options.reading, options)
 
     def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
@@ -262,7 +262,7 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Question:
     """The question that every mask of a batch is asked: references and options; `seconds` were spent to open them."""
 
     references: list[AnyReference]

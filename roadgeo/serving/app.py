@@ -30,7 +30,7 @@ from roadgeo.serving.page import page_file, page_text, policy_of
 from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.serving.view import KEPT, OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
-from roadgeo.serving.workers import Answer, Asked, Workers
+from roadgeo.serving.workers import ImageRequest, Reply, Workers
 
 __all__ = ["Service"]
 
@@ -123,17 +123,17 @@ class Service:
             await asyncio.to_thread(_copy, old, folder, "take" in hints)
             return self._start(Job(folder, old.image, old.name, hints), came, f"../{folder.name}")
 
-    async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
+    async def _ask(self, job: Job, came: float, keeps: bool = False) -> Reply:
         """Have a process locate an image, and report its place to the listener."""
         loop, hints = asyncio.get_running_loop(), dict(job.hints)
         limit = min(hints.pop(LIMIT, self.options.time_limit_s), self.options.time_limit_s)
-        asked = Asked(str(job.path), hints, limit, self.options.max_pixels, job.name, keeps)
+        task = ImageRequest(str(job.path), hints, limit, self.options.max_pixels, job.name, keeps)
 
         def say(text: str, share: float | None = None) -> None:
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(job.tell, text, share)
 
-        answer = await loop.run_in_executor(self._threads, self.workers.ask, asked, say, job.called_off)
+        answer = await loop.run_in_executor(self._threads, self.workers.ask, task, say, job.called_off)
         if answer.status == 200 and self._listener is not None:
             await loop.run_in_executor(self._threads, _report, self._listener, answer.document, came)
         return answer
@@ -153,7 +153,7 @@ class Service:
                 answer = await self._ask(job, came, keeps=True)
             except Exception:
                 _LOG.exception("a fault of the server at a job")
-                answer = Answer(500, {"detail": "a fault of roadgeo: its log tells which"})
+                answer = Reply(500, {"detail": "a fault of roadgeo: its log tells which"})
         if answer.lacks_view:
             self._jobs.make_room()
         job.end(answer)
@@ -213,9 +213,9 @@ class Service:
         job, name = self._find(request), request.path_params["name"]
         if name not in OFFERED or job.status != "successful":
             raise HTTPException(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
-        asked = Asked(str(job.path), {}, _WRITE_S, self.options.max_pixels, wanted=name)
+        task = ImageRequest(str(job.path), {}, _WRITE_S, self.options.max_pixels, wanted=name)
         with self.workers.take_place():
-            answer = await asyncio.get_running_loop().run_in_executor(self._threads, self.workers.ask, asked)
+            answer = await asyncio.get_running_loop().run_in_executor(self._threads, self.workers.ask, task)
         if answer.status >= 400:
             return _respond(answer, {})
         path = Path(answer.document["file"])
@@ -316,7 +316,7 @@ def _report(listener: Listener, document: dict[str, Any], came: float) -> None:
         _LOG.exception("a place could not be reported")
 
 
-def _respond(answer: Answer, document: dict[str, Any]) -> Response:
+def _respond(answer: Reply, document: dict[str, Any]) -> Response:
     return problem(answer.status, answer.document["detail"]) if answer.status >= 400 else JSONResponse(document)
 
 

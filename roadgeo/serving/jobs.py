@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.view import SENT
-from roadgeo.serving.workers import Answer
+from roadgeo.serving.workers import Reply
 
 __all__ = ["Job", "Jobs", "Status"]
 
@@ -50,7 +50,7 @@ class Job:
     status: Status = "accepted"
     message: str = "waiting for a free process"
     progress: int = 0
-    answer: Answer | None = None
+    answer: Reply | None = None
     called_off: threading.Event = field(default_factory=threading.Event)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -73,7 +73,7 @@ class Job:
         """Record the progress."""
         self._become("running", text, 0 if share is None else round(100 * min(max(share, 0.0), 1.0)))
 
-    def end(self, answer: Answer) -> None:
+    def end(self, answer: Reply) -> None:
         """Keep the answer."""
         found = answer.status == 200
         self.answer = None if self.is_over else answer

@@ -25,7 +25,7 @@ from roadgeo.running.pool import Died, Ended, Lost, Pool
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
 
-__all__ = ["Answer", "Asked", "Full", "Serving", "Workers"]
+__all__ = ["Full", "ImageRequest", "Reply", "Serving", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Full(HTTPException):
 
 
 @dataclass(frozen=True)
-class Asked:
+class ImageRequest:
     """A request to locate.
 
     Attributes
@@ -78,7 +78,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Reply:
     """An HTTP status, and the document or, from 400 on, the sentence that describes the error.
 
     Attributes
@@ -120,7 +120,7 @@ class Workers:
         within = fence and replace(fence, write=(*fence.write, own), temporary=own)
         work = Serving(tuple(references), threads)
         self._processes = Processes(work, count, grace_s=0.0, clean=clean, within=within)
-        self._pool = Pool[Asked, Answer](self._processes, again_alone=False)
+        self._pool = Pool[ImageRequest, Reply](self._processes, again_alone=False)
         self._places = threading.Semaphore(count + waiting)
         try:
             self._processes.wait_until_ready()
@@ -144,7 +144,7 @@ class Workers:
         place.callback(self._places.release)
         return place
 
-    def ask(self, asked: Asked, say: Say = say_nothing, called_off: threading.Event | None = None) -> Answer:
+    def ask(self, request: ImageRequest, say: Say = say_nothing, called_off: threading.Event | None = None) -> Reply:
         """Have one process locate, as soon as one is free; who asks holds a place.
 
         Parameters
@@ -154,16 +154,16 @@ class Workers:
         called_off : Event, optional
             Once it is set nobody waits for the answer any more.
         """
-        patience_s = asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S)
+        patience_s = request.time_limit_s + (_PATIENT_S if request.keeps else _GRACE_S)
         try:
-            answer = self._pool.do(asked, patience_s, say, called_off)
+            reply = self._pool.do(request, patience_s, say, called_off)
         except RoadgeoError as error:  # a process that was started anew cannot open the references any more
-            return Answer(503, {"detail": str(error)})
-        if not isinstance(answer, Lost):
-            return answer
-        _LOG.warning("no answer: %s", answer.said)
-        status, sentence = _LOST[answer.why]
-        return Answer(status, {"detail": sentence.format(answer.said)})
+            return Reply(503, {"detail": str(error)})
+        if not isinstance(reply, Lost):
+            return reply
+        _LOG.warning("no answer: %s", reply.said)
+        status, sentence = _LOST[reply.why]
+        return Reply(status, {"detail": sentence.format(reply.said)})
 
     def close(self) -> None:
         """End all processes."""
@@ -181,7 +181,7 @@ class Serving:
     references: tuple[str, ...]
     threads: int
 
-    def prepare(self) -> Callable[[Asked], Answer]:
+    def prepare(self) -> Callable[[ImageRequest], Reply]:
         """Open the references, and load the network."""
         from roadgeo.errors import ModelError
         from roadgeo.kernels.warmup import warm_up
@@ -192,29 +192,29 @@ class Serving:
         warm_up()
         with suppress(ModelError):  # masks are located without it
             load_model("", None, self.threads)
-        return lambda asked: _answer(asked, references, tell if asked.keeps else say_nothing, self.threads)
+        return lambda request: _reply(request, references, tell if request.keeps else say_nothing, self.threads)
 
 
-def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Answer:
-    """Do what is asked; the one place where what goes wrong with an image is caught."""
+def _reply(request: ImageRequest, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Reply:
+    """Locate the image, or write an output; the one place where what goes wrong with an image is caught."""
     from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
 
     try:
-        return _write(asked, references) if asked.wanted else _locate(asked, references, say, threads)
+        return _write(request, references) if request.wanted else _locate(request, references, say, threads)
     except (MaskError, OutputError) as error:
-        return Answer(422, {"detail": _without(asked.path, str(error))})
+        return Reply(422, {"detail": _without(request.path, str(error))})
     except ModelError as error:  # the image is a photograph, and none are read here
-        return Answer(415, {"detail": _without(asked.path, str(error))})
+        return Reply(415, {"detail": _without(request.path, str(error))})
     except RoadgeoError as error:
-        return Answer(500, {"detail": _without(asked.path, str(error))})
+        return Reply(500, {"detail": _without(request.path, str(error))})
     except Exception as error:
         _LOG.exception("a fault of roadgeo")
-        return Answer(
-            500, {"detail": f"a fault of roadgeo: {type(error).__name__}: {_without(asked.path, str(error))}"}
+        return Reply(
+            500, {"detail": f"a fault of roadgeo: {type(error).__name__}: {_without(request.path, str(error))}"}
         )
 
 
-def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> Answer:
+def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads: int) -> Reply:
     from roadgeo.matching.hints import apply_hints
     from roadgeo.running.choosing import take_place
     from roadgeo.running.options import ReadOptions
@@ -224,50 +224,50 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     from roadgeo.storage.rasters import raster_size
     from roadgeo.workflows import LocateOptions, locate
 
-    def search(*asked_of: Any) -> Any:
+    def search(*arguments: Any) -> Any:
         say("searching the map")
-        return locate(*asked_of)
+        return locate(*arguments)
 
     def tell(text: str, share: float | None = None) -> None:
-        say(_without(asked.path, text), share)
+        say(_without(request.path, text), share)
 
-    width, height = raster_size(asked.path)
-    if width * height > asked.max_pixels:
-        detail = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
-        return Answer(413, {"detail": detail})
-    hints = {**asked.hints, "time_limit_s": asked.time_limit_s}
+    width, height = raster_size(request.path)
+    if width * height > request.max_pixels:
+        detail = f"{width} x {height} pixels, expected at most {request.max_pixels:,} in all: reduce it"
+        return Reply(413, {"detail": detail})
+    hints = {**request.hints, "time_limit_s": request.time_limit_s}
     if hints.get("focal_px") == "exif":
-        hints["focal_px"] = focal_in_pixels(asked.path)
+        hints["focal_px"] = focal_in_pixels(request.path)
     taken, options = hints.pop("take", None), apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
-    seen = Path(asked.path).parent.with_name(OWN) / SEEN
-    is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
+    seen = Path(request.path).parent.with_name(OWN) / SEEN
+    is_known = seen.is_file() and not request.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
-    image, query = str(seen) if is_known else asked.path, ReadOptions(threads=threads)
-    sighting = None if taken is None else read_sighting(Path(asked.path))  # of the answer whose place is taken
+    image, query = str(seen) if is_known else request.path, ReadOptions(threads=threads)
+    sighting = None if taken is None else read_sighting(Path(request.path))  # of the answer whose place is taken
     if sighting is None:
         sighting = locate_query(image, references, options, query, how=search, say=tell)
         sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     if taken is not None:
         sighting = sighting.told(take_place(sighting.location, taken, options))
-    location = replace(sighting.location, query=asked.name)
-    location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
+    location = replace(sighting.location, query=request.name)
+    location = replace(location, reason=_without(request.path, _without(str(seen), location.reason)))
     lacks_view = False
-    if asked.keeps:
+    if request.keeps:
         say("drawing the answer")
         try:
-            write_view(Path(asked.path), replace(sighting, location=location), references)
+            write_view(Path(request.path), replace(sighting, location=location), references)
         except OSError:  # a full disk: the place was found all the same
             _LOG.exception("an answer is kept without its view")
             lacks_view = True
-    return Answer(200, location.to_dict(), lacks_view)
+    return Reply(200, location.to_dict(), lacks_view)
 
 
-def _write(asked: Asked, references: Sequence[Any]) -> Answer:
+def _write(request: ImageRequest, references: Sequence[Any]) -> Reply:
     from roadgeo.serving.view import write_output
 
-    return Answer(200, {"file": str(write_output(Path(asked.path), asked.wanted, references))})
+    return Reply(200, {"file": str(write_output(Path(request.path), request.wanted, references))})
 
 
 def _without(path: str, message: str) -> str:

@@ -3,25 +3,25 @@
 import numpy as np
 import pytest
 
-from roadgeo.flights.candidates import Candidates, Look
+from roadgeo.flights.candidates import Candidates, MosaicQuery
 from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 
 
-def look_at(flown, count, searched):
+def mosaic_of(flown, count, searched):
     flight, masks, _ = flown
     mosaic = lay_together(masks[:count], list(flight.motion[:count]), 8.0)
-    return Look(read_query(mosaic.mask), mosaic, range(count), searched)
+    return MosaicQuery(read_query(mosaic.mask), mosaic, range(count), searched)
 
 
-def off_by(location, flown, look):
+def off_by(location, flown, frames):
     """How far the middle of the last frame lies from the truth, metres."""
     flight, _, reference = flown
     middle = np.array([200.0, 150.0])
-    found = location.pixel_to_map(Homography(look.mosaic.to_mosaic[-1])(middle)[None])[0]
-    truth = reference.index.plane.to_crs(flight.views[look.numbers[-1]].homography(middle)[None])[0]
+    found = location.pixel_to_map(Homography(frames.mosaic.to_mosaic[-1])(middle)[None])[0]
+    truth = reference.index.plane.to_crs(flight.views[frames.numbers[-1]].homography(middle)[None])[0]
     return np.hypot(*(found - truth))
 
 
@@ -33,37 +33,37 @@ def weak():
 def test_what_a_weak_look_proposed_is_found_by_ground_that_comes_later(flown):
     """The map is not searched again: the place stands by what is seen after it was proposed."""
     candidates = Candidates([flown[2]])
-    first = candidates.look(look_at(flown, 4, True), weak())
+    first = candidates.decide(mosaic_of(flown, 4, True), weak())
     assert not first.located
     assert len(candidates) > 1
-    alone = candidates.look(look_at(flown, 4, False), weak())
+    alone = candidates.decide(mosaic_of(flown, 4, False), weak())
     assert alone.log10_odds == pytest.approx(
         first.log10_odds, abs=3.0
     )  # the same ground, and no places that were tried
-    later = look_at(flown, 8, False)
-    location = candidates.look(later, LocateOptions())
+    later = mosaic_of(flown, 8, False)
+    location = candidates.decide(later, LocateOptions())
     assert location.located
     assert location.log10_odds > first.log10_odds
     assert off_by(location, flown, later) < 5.0
 
 
 def test_each_search_takes_its_share_off(flown):
-    first, again = Candidates([flown[2]]), Candidates([flown[2]], n_looks=9)
-    odds = [item.look(look_at(flown, 6, True), LocateOptions()).log10_odds for item in (first, again)]
+    first, again = Candidates([flown[2]]), Candidates([flown[2]], n_searches=9)
+    odds = [item.decide(mosaic_of(flown, 6, True), LocateOptions()).log10_odds for item in (first, again)]
     assert odds[0] - odds[1] == pytest.approx(1.0)
-    assert (first.n_looks, again.n_looks) == (1, 10)
-    before = first.look(look_at(flown, 6, False), LocateOptions()).log10_odds
-    assert first.n_looks == 1
+    assert (first.n_searches, again.n_searches) == (1, 10)
+    before = first.decide(mosaic_of(flown, 6, False), LocateOptions()).log10_odds
+    assert first.n_searches == 1
     assert before == pytest.approx(odds[0], abs=3.0)
 
 
 def test_the_places_that_explain_most_are_kept(flown, monkeypatch):
     monkeypatch.setattr("roadgeo.flights.candidates.MOST", 3)
     candidates = Candidates([flown[2]])
-    candidates.look(look_at(flown, 4, True), weak())
+    candidates.decide(mosaic_of(flown, 4, True), weak())
     assert len(candidates) == 3
-    later = look_at(flown, 8, False)
-    location = candidates.look(later, LocateOptions())
+    later = mosaic_of(flown, 8, False)
+    location = candidates.decide(later, LocateOptions())
     assert location.located
     assert off_by(location, flown, later) < 5.0
 
@@ -71,10 +71,10 @@ def test_the_places_that_explain_most_are_kept(flown, monkeypatch):
 def test_places_whose_frames_left_the_view_are_forgotten(flown):
     """A place is known by one of its frames: where that is no longer laid with the others, it says nothing of them."""
     candidates = Candidates([flown[2]])
-    candidates.look(look_at(flown, 4, True), weak())
+    candidates.decide(mosaic_of(flown, 4, True), weak())
     assert len(candidates) > 1
-    elsewhere = look_at(flown, 4, False)
-    gone = Look(elsewhere.query, elsewhere.mosaic, [100 + number for number in elsewhere.numbers], False)
-    location = candidates.look(gone, LocateOptions())
+    elsewhere = mosaic_of(flown, 4, False)
+    gone = MosaicQuery(elsewhere.query, elsewhere.mosaic, [100 + number for number in elsewhere.numbers], False)
+    location = candidates.decide(gone, LocateOptions())
     assert not location.located
     assert len(candidates) == 0

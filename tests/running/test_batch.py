@@ -16,7 +16,7 @@ from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
-from roadgeo.running.locating import Asked, Locating, Outcome
+from roadgeo.running.locating import Locating, Outcome, Question
 from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import SUFFIXES, VIDEOS, Task, find_masks, name_tasks
 
@@ -189,7 +189,7 @@ class Hazard:
 def hazardous(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> Outcome:
     patch.setattr("roadgeo.running.queries.open_mask", Hazard())
     work = Locating((), str(folder), BatchOptions(), say_nothing)
-    return work.do(Task(f"{kind}.png", kind), Asked([], 0.0, {}))
+    return work.do(Task(f"{kind}.png", kind), Question([], 0.0, {}))
 
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)

@@ -22,7 +22,7 @@ from roadgeo.reference.reference import Reference
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import _answer
+from roadgeo.serving.workers import _reply
 from roadgeo.workflows import locate
 
 FLAGS = [
@@ -42,7 +42,7 @@ class Direct(Workers):
     def ask(self, asked, say=None, called_off=None):
         if not asked.wanted:
             super().ask(asked, say, called_off)
-        return _answer(asked, self.references, say)
+        return _reply(asked, self.references, say)
 
     def close(self):
         """Serve again: the images stay."""

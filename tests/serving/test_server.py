@@ -27,7 +27,7 @@ from roadgeo.running.looks import Sighting
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import Answer, Full, _answer
+from roadgeo.serving.workers import Full, Reply, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
@@ -58,7 +58,7 @@ class Workers:
         while not self.goes_on.wait(0.02) and not called_off.is_set():
             pass
         self.asked.append(asked)
-        return Answer(200, {**FOUND, "query": asked.name} if asked.name else FOUND)
+        return Reply(200, {**FOUND, "query": asked.name} if asked.name else FOUND)
 
     def close(self):
         self._temporary.cleanup()
@@ -236,7 +236,7 @@ def test_a_body_that_may_be_taken_is_asked_for():
 )
 def test_what_workers_refuse_is_a_problem(status, detail, again):
     workers = Workers()
-    workers.ask = lambda *_: Answer(status, {"detail": detail})
+    workers.ask = lambda *_: Reply(status, {"detail": detail})
     with serving(workers) as server:
         answer, document = ask(server, "POST", "/locate", PNG)
     assert answer.status == document["status"] == status
@@ -299,7 +299,7 @@ def test_an_answer_without_its_view_is_kept_and_makes_room():
     workers = Workers()
     with serving(workers) as server:
         old = finished(server)
-        workers.ask = lambda *_: Answer(200, FOUND, lacks_view=True)
+        workers.ask = lambda *_: Reply(200, FOUND, lacks_view=True)
         job = finished(server)
         assert ask(server, "GET", f"/jobs/{job}/results")[1] == {"location": FOUND}
         assert ask(server, "GET", f"/jobs/{old}")[0].status == 404
@@ -375,7 +375,7 @@ def test_who_waits_while_the_server_ends_is_told():
 
     def ask_until_end(*_):
         ended.wait(10.0)
-        return Answer(503, {"detail": "the server is ending; come again"})
+        return Reply(503, {"detail": "the server is ending; come again"})
 
     close = workers.close
     workers.ask, workers.close = ask_until_end, lambda: (ended.set(), close())
@@ -543,7 +543,7 @@ def test_progress_is_told_as_it_is_made():
 
 def test_a_job_that_fails_says_why():
     workers = Workers()
-    workers.ask = lambda *_: Answer(422, {"detail": "the image: no road in it"})
+    workers.ask = lambda *_: Reply(422, {"detail": "the image: no road in it"})
     with serving(workers) as server:
         job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
         assert wait_for(server, job, "failed")["message"] == "the image: no road in it"
@@ -657,7 +657,7 @@ def test_an_image_stays_as_it_was_sent_whatever_it_is_called(name, town, monkeyp
     monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
     network, index = town
     workers, references = Workers(), [Reference(index, network)]
-    workers.ask = lambda asked, *_: workers.asked.append(asked) or _answer(asked, references)
+    workers.ask = lambda asked, *_: workers.asked.append(asked) or _reply(asked, references)
     image = cv2.imencode(Path(name).suffix, np.full((40, 60, 3), 99, np.uint8))[1].tobytes()
     body, headers = form((b'name="image"; filename="%b"' % name.encode(), image))
     with serving(workers) as server:

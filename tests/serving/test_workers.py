@@ -34,7 +34,7 @@ from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Sighting
 from roadgeo.running.pool import Died
-from roadgeo.serving.workers import Asked, Serving, Workers, _answer
+from roadgeo.serving.workers import ImageRequest, Serving, Workers, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
@@ -55,13 +55,13 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
     try:
         for name, (content, status) in hostile.items():
             (tmp_path / name).write_bytes(content)
-            answer = workers.ask(Asked(str(tmp_path / name), {}, 5.0, 64_000_000))
+            answer = workers.ask(ImageRequest(str(tmp_path / name), {}, 5.0, 64_000_000))
             assert answer.status == status, (name, answer)
             assert str(tmp_path) not in answer.document["detail"]
         first = workers._processes.all[0].process
         first.kill()
         first.join()
-        answer = workers.ask(Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
+        answer = workers.ask(ImageRequest(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
         assert answer.status == 200
         found = answer.document
         assert found["status"] == "located"
@@ -76,11 +76,11 @@ def test_what_a_process_answers(place, tmp_path):
     (tmp_path / "bomb.png").write_bytes(png(60_000, 60_000))
     cv2.imwrite(str(tmp_path / "mask.tif"), cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE))
     asked = [
-        Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "mask.tif"), {"near": (0.0, 0.0, 10.0)}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "mask.tif"), {}, 10.0, 100),
-        Asked(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
+        ImageRequest(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000),
+        ImageRequest(str(tmp_path / "mask.tif"), {"near": (0.0, 0.0, 10.0)}, 10.0, 64_000_000),
+        ImageRequest(str(tmp_path / "mask.tif"), {}, 10.0, 100),
+        ImageRequest(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
+        ImageRequest(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
     ]
     found, elsewhere, small, bomb, cut = map(Serving((str(folder / "town.gpkg"),), 1).prepare(), asked)
     assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
@@ -98,7 +98,9 @@ def test_a_fault_is_answered_and_not_where_files_lie(place, monkeypatch):
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
     folder, _ = place
-    answer = _answer(Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000), [open_reference(folder / "town.gpkg")])
+    answer = _reply(
+        ImageRequest(str(folder / "mask.png"), {}, 10.0, 64_000_000), [open_reference(folder / "town.gpkg")]
+    )
     assert answer.status == 500
     assert answer.document == {"detail": "a fault of roadgeo: ZeroDivisionError: in the image"}
 
@@ -117,24 +119,24 @@ def test_a_port_that_is_taken_is_said(place, capsys):
 @pytest.fixture
 def one_worker(place):
     workers = Workers([str(place[0] / "town.gpkg")], 1, 2)
-    yield workers, Asked(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000)
+    yield workers, ImageRequest(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000)
     workers.close()
 
 
 @contextmanager
-def asked_beside(workers, asked):
+def request_beside(workers, request):
     """Ask a process that stands still: a list that holds the answer after the block."""
     answers = []
     os.kill(workers._processes.all[0].process.pid, signal.SIGSTOP)
-    thread = threading.Thread(target=lambda: answers.append(workers.ask(asked)))
+    thread = threading.Thread(target=lambda: answers.append(workers.ask(request)))
     thread.start()
     yield answers
     thread.join(60)
 
 
 def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
-    workers, asked = one_worker
-    with asked_beside(workers, asked) as answers:
+    workers, request = one_worker
+    with request_beside(workers, request) as answers:
         time.sleep(0.2)
         workers._processes.all[0].process.kill()
     assert [answer.status for answer in answers] == [200]
@@ -144,40 +146,40 @@ def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
     def broken(self, *_):
         raise Died
 
-    workers, asked = one_worker
+    workers, request = one_worker
     with monkeypatch.context() as patch:
         patch.setattr("roadgeo.running.processes._Process.ask", broken)
-        assert workers.ask(asked).status == 500
-    assert workers.ask(asked).status == 200
+        assert workers.ask(request).status == 500
+    assert workers.ask(request).status == 200
 
 
 def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
-    workers, asked = one_worker
+    workers, request = one_worker
     monkeypatch.setattr("roadgeo.serving.workers._GRACE_S", 0.3)
-    with asked_beside(workers, replace(asked, time_limit_s=0.2)) as answers:
+    with request_beside(workers, replace(request, time_limit_s=0.2)) as answers:
         pass
     assert [answer.status for answer in answers] == [503]
     assert "longer than 0.5 s" in answers[0].document["detail"]
     monkeypatch.undo()
-    assert workers.ask(asked).status == 200
+    assert workers.ask(request).status == 200
 
 
 def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch):
     def none(*_, **__):
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
-    workers, asked = one_worker
+    workers, request = one_worker
     workers._processes.all[0].process.kill()
     with monkeypatch.context() as patch:
         patch.setattr("multiprocessing.process.BaseProcess.start", none)
-        assert [workers.ask(asked).status for _ in range(2)] == [503, 503]
-    assert workers.ask(asked).status == 200
+        assert [workers.ask(request).status for _ in range(2)] == [503, 503]
+    assert workers.ask(request).status == 200
 
 
 def test_who_asks_while_the_server_ends_is_told(one_worker):
-    workers, asked = one_worker
+    workers, request = one_worker
     process = workers._processes.all[0].process
-    with asked_beside(workers, asked) as answers:
+    with request_beside(workers, request) as answers:
         time.sleep(0.2)
         workers.close()
     assert [answer.status for answer in answers] == [503]
@@ -190,7 +192,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
 
     monkeypatch.setattr("roadgeo.storage.rasters.raster_size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
-    answer = _answer(Asked("/images/sent/photo.jpg", {}, 1.0, 1000), [])
+    answer = _reply(ImageRequest("/images/sent/photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415
     assert "onnxruntime" in answer.document["detail"]
 
@@ -210,8 +212,8 @@ def test_the_roads_of_a_photograph_are_found_once(tmp_path, town, monkeypatch):
     image = tmp_path / "sent" / "photo.png"
     cv2.imwrite(str(image), np.full((40, 60, 3), 99, np.uint8))
     for hints in ({}, {"near": (0.0, 0.0, 9.0)}, {"gsd_m": (1.0, 2.0)}):
-        asked = Asked(str(image), hints, 1.0, 10_000, keeps=True)
-        assert _answer(asked, [Reference(index, network)]).status == 200
+        request = ImageRequest(str(image), hints, 1.0, 10_000, keeps=True)
+        assert _reply(request, [Reference(index, network)]).status == 200
         assert json.loads((tmp_path / "own" / "view.json").read_text())["is_photograph"] is True
     assert asked_of == ["photo.png", "seen.tif", "photo.png"]
 
@@ -221,8 +223,8 @@ def test_a_place_is_told_though_there_is_no_room_for_its_view(place, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("roadgeo.serving.view.write_view", full)
-    asked = Asked(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000, keeps=True)
-    answer = _answer(asked, [open_reference(place[0] / "town.gpkg")])
+    request = ImageRequest(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000, keeps=True)
+    answer = _reply(request, [open_reference(place[0] / "town.gpkg")])
     assert (answer.status, answer.document["status"], answer.lacks_view) == (200, "located", True)
 
 

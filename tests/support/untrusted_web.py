@@ -18,7 +18,7 @@ from uvicorn.server import ServerState
 
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
-from roadgeo.serving.workers import Answer
+from roadgeo.serving.workers import Reply
 
 
 @contextmanager
@@ -59,7 +59,7 @@ class _Wire(asyncio.Transport):
 
 
 _LIMITS = ServeOptions(body_s=0.2)
-_WORKERS = SimpleNamespace(take_place=ExitStack, ask=lambda *_: Answer(200, {}))
+_WORKERS = SimpleNamespace(take_place=ExitStack, ask=lambda *_: Reply(200, {}))
 
 
 def serve_request(content: bytes) -> bytes:
