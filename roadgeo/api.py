@@ -221,8 +221,8 @@ def locate(
     """
     from roadgeo.running.choosing import take_place
     from roadgeo.running.locating import changed_options
-    from roadgeo.running.looks import Sighting
     from roadgeo.running.options import ReadOptions
+    from roadgeo.running.passes import Sighting
     from roadgeo.running.pictures import pixels_of, read_picture
     from roadgeo.running.queries import locate_query
     from roadgeo.workflows import locate as locate_mask
@@ -251,7 +251,7 @@ def locate(
     else:
         sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
     if take is not None:
-        sighting = sighting.told(take_place(sighting.location, take, options))
+        sighting = sighting.answering(take_place(sighting.location, take, options))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
     origin = {"options": changed, "reference_digest": digest_of(references, sighting.location.reference)}
     found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
@@ -415,9 +415,9 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
     from roadgeo.matching.scene import trace_query
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.pictures import read_picture
-    from roadgeo.running.queries import look_once
+    from roadgeo.running.queries import read_roads
 
-    seen = look_once(read_picture(image), _hint("gsd", gsd), ReadOptions())
+    seen = read_roads(read_picture(image), _hint("gsd", gsd), ReadOptions())
     _, graph = trace_query(seen.mask)
     return graph.to_networkx(
         lambda xy: seen.coarser * plane_to_pixel(xy),

@@ -123,7 +123,7 @@ def test_a_photograph_goes_the_way_of_the_command_line(
     porto: roadgeo.Reference, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from roadgeo.running import queries
-    from roadgeo.running.looks import Sighting
+    from roadgeo.running.passes import Sighting
 
     def segmented(path: str, *_: object) -> Sighting:
         return Sighting(roadgeo.Location(path, "not_located", "hardly a road"), roadgeo.RoadMask(np.zeros((9, 9))))
@@ -166,7 +166,7 @@ def test_photographs_that_are_no_files_are_segmented_as_files_are(
     kind: str, porto: roadgeo.Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from roadgeo.running import queries
-    from roadgeo.running.looks import Sighting
+    from roadgeo.running.passes import Sighting
 
     photograph = cv2.cvtColor(cv2.imread(str(PHOTO)), cv2.COLOR_BGR2RGB)
     given = {"array": photograph, "floats": photograph / 255.0, "PIL": Image.fromarray(photograph)}[kind]

@@ -71,9 +71,9 @@ def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, reading: 
     from roadgeo.outputs.paths import output_paths
     from roadgeo.outputs.vectorized import write_vectorized
     from roadgeo.running.probability_files import keep_probability
-    from roadgeo.running.queries import look_once
+    from roadgeo.running.queries import read_roads
 
-    look = look_once(task.mask, gsd_m, reading, say)
+    look = read_roads(task.mask, gsd_m, reading, say)
     kept = keep_probability(look.probability, output_paths(out_dir, task.stem))
     if kept and not look.mask.roads.any():
         raise MaskError(f"{task.mask}: no road is seen in it that is probable enough; wrote {kept[0]}, to look at")

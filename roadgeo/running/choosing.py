@@ -18,10 +18,10 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.matching.verdict import match_again
 from roadgeo.reference.opening import AnyReference
-from roadgeo.running.looks import Sighting
 from roadgeo.running.options import ReadOptions
+from roadgeo.running.passes import Sighting
 from roadgeo.running.probability_files import is_ours
-from roadgeo.running.queries import look_once
+from roadgeo.running.queries import read_roads
 from roadgeo.running.variants import resampled
 
 __all__ = ["take_again", "take_place"]
@@ -85,7 +85,7 @@ def take_again(
     """
     location = take_place(answer, taken, options)
     place, of_photograph = location.places[0], is_ours(kept)
-    first = look_once(str(kept) if of_photograph else image, (place.gsd_m, place.gsd_m), reading)
+    first = read_roads(str(kept) if of_photograph else image, (place.gsd_m, place.gsd_m), reading)
     height_width = place.size[::-1]
     mask = first.mask if first.mask.shape == height_width else resampled(first.mask, height_width).mask
     mask = replace(mask, name=image)

@@ -126,7 +126,7 @@ def _locate(
     references: Sequence[AnyReference],
     options: LocateOptions,
 ) -> Location:
-    """Search all parts of a map for a mask (see `looks.Locate`).
+    """Search all parts of a map for a mask (see `passes.Locate`).
 
     Raises
     ------

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.opening import AnyReference
-    from roadgeo.running.looks import Locate, Sighting
+    from roadgeo.running.passes import Locate, Sighting
     from roadgeo.workflows import LocateOptions
 
 __all__ = ["Locating", "Outcome", "Question", "changed_options"]
@@ -196,7 +196,7 @@ class Locating:
         if sighting is None:
             sighting = locate_query(task.mask, question.references, options, reading, how=how, say=self.say)
             if self.options.taken is not None:
-                sighting = sighting.told(take_place(sighting.location, self.options.taken, options))
+                sighting = sighting.answering(take_place(sighting.location, self.options.taken, options))
         sighting = sighting.showing(stated=None if sighting.location.place is None else read_stated_middle(task.mask))
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         # the clock of the search knows its own steps only: the rest was reading

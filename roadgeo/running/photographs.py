@@ -26,8 +26,8 @@ from roadgeo.matching.verdict import searched_within
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.opening import AnyReference
 from roadgeo.roads.thresholds import spread_probability
-from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions, is_model
+from roadgeo.running.passes import Locate, PassRoads, Sighting, locate_passes
 from roadgeo.running.variants import in_pixels_of, resampled
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import read_mask
@@ -37,7 +37,15 @@ from roadgeo.sources.segmentation.probability import ProbabilityMap, mean_of
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
 
-__all__ = ["Frame", "Look", "call_segmenter", "load_model", "locate_photograph", "open_frame", "plugin_of"]
+__all__ = [
+    "Pass",
+    "SegmentedPhotograph",
+    "call_segmenter",
+    "load_model",
+    "locate_photograph",
+    "open_segmented",
+    "plugin_of",
+]
 
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
@@ -55,13 +63,13 @@ _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 
 @dataclass(frozen=True)
-class Look:
-    """One look at a photograph through a model.
+class Pass:
+    """One pass over a photograph through a model.
 
     Attributes
     ----------
     rank : int
-        Rank of its scale among the scales worth trying, the most promising first.
+        Rank of its scale among the scales to try, the most promising first.
     finer : float
         How many times finer than that the photograph is shown.
     ways : int or None
@@ -71,7 +79,7 @@ class Look:
     lower : bool
         At a threshold lower than the model's own.
     note : str
-        What distinguishes it from other looks at that scale, for people.
+        What distinguishes it from other passes at that scale, for people.
     """
 
     rank: int = 0
@@ -82,7 +90,7 @@ class Look:
     note: str = ""
 
 
-class Frame:
+class SegmentedPhotograph:
     """A photograph, open to be shown to a model.
 
     Attributes
@@ -94,7 +102,7 @@ class Frame:
     coarser : float
         Pixels of the photograph for each of the grid, along a side.
     n_scales, n_further : int
-        Number of scales worth trying; and of the ones beyond a given scale. That states how large the ground is, not
+        Number of scales to try; and of the ones beyond a given scale. That states how large the ground is, not
         at which scale the model sees it best.
     """
 
@@ -104,7 +112,7 @@ class Frame:
         self.network = load_model(reading.segmenter, reading.class_name, reading.threads)
         self.ways = 1 if reading.segmenter else _WAYS
         #: Probability of road by scale and number of ways.
-        self._seen: dict[tuple[float, int], ProbabilityMap] = {}
+        self._shown: dict[tuple[float, int], ProbabilityMap] = {}
         k = max(1, math.ceil(math.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS)))
         self.own = round(photograph.height / k), round(photograph.width / k)
         self._scales, self.n_scales, self.n_further = self._known_scales()
@@ -112,31 +120,31 @@ class Frame:
         self.grid, self.coarser = (round(finer * self.own[0]), round(finer * self.own[1])), k / finer
 
     def _known_scales(self) -> tuple[list[float], int, int]:
-        """Return the scales that are known, and how many there are with others: one where a pixel's size is known.
+        """Return the scales that are known, the number of scales to try, and of further ones.
 
-        And how many further ones there are then.
+        Where the size of a pixel is known there is one, and further ones come last.
         """
         low, high = self.gsd_m
         if high <= _KNOWN_SPAN * low:
-            told = scale_of(math.sqrt(low * high), self.network)
-            further = [scale for scale in try_scales(self.photograph, self.network) if scale != told]
-            return [told], 1, min(_MAX_SCALES, len(further))
+            own = scale_of(math.sqrt(low * high), self.network)
+            further = [scale for scale in try_scales(self.photograph, self.network) if scale != own]
+            return [own], 1, min(_MAX_SCALES, len(further))
         stated = estimate_gsd(self.photograph.name)
-        known = [scale_of(stated, self.network)] if stated is not None and low <= stated <= high else []
-        n_scales = len(known) + len(try_scales(self.photograph, self.network, self.gsd_m))
-        return known, min(_MAX_SCALES, n_scales), 0
+        stated_scales = [scale_of(stated, self.network)] if stated is not None and low <= stated <= high else []
+        n_scales = len(stated_scales) + len(try_scales(self.photograph, self.network, self.gsd_m))
+        return stated_scales, min(_MAX_SCALES, n_scales), 0
 
     def scale(self, rank: int) -> float:
-        """Return a scale worth trying; where it is not known, the photograph is shown to the model at many."""
+        """Return a scale to try; where none is known, the photograph is shown to the model at many."""
         if rank >= len(self._scales):
             self.say(f"looking for the scale of {self.photograph.name}")
-            found = rank_scales(self.photograph, self.network, *() if self.n_further else (self.gsd_m,))
-            self._seen.update({(scale, 1): seen for scale, seen in found.items() if seen is not None})
-            self._scales += [scale for scale in found if not self.n_further or scale not in self._scales]
+            ranked = rank_scales(self.photograph, self.network, *() if self.n_further else (self.gsd_m,))
+            self._shown.update({(scale, 1): shown for scale, shown in ranked.items() if shown is not None})
+            self._scales += [scale for scale in ranked if not self.n_further or scale not in self._scales]
         return self._scales[rank]
 
-    def looks(self) -> list[Look]:
-        """Return the best scale's look, other scales, the photograph in more ways, and a lower threshold at the best.
+    def passes(self) -> list[Pass]:
+        """Return the best scale's pass, other scales, the photograph in more ways, and a lower threshold at the best.
 
         The model is shown it in one way first where that was done already, but not at the next finer scale, and where
         there is much to show. Beyond scales that were tried a model of others is shown it in more ways:
@@ -147,48 +155,49 @@ class Frame:
         best = self.scale(0)
         in_one = self._was_shown_alone(best) or math.prod(self._shape_at(best)) > _MANY_PIXELS
         has_more = (in_one and self.n_scales == 1) or self.ways < _WAYS
-        looks = [Look(ways=1 if in_one else None)]
-        most = _WAYS if has_more else looks[0].ways
-        looks += [Look(rank, as_shown=True) for rank in range(1, self.n_scales)]
+        passes = [Pass(ways=1 if in_one else None)]
+        most = _WAYS if has_more else passes[0].ways
+        passes += [Pass(rank, as_shown=True) for rank in range(1, self.n_scales)]
         if has_more:
-            looks.append(Look(ways=most, note=f", shown {most} ways"))
+            passes.append(Pass(ways=most, note=f", shown {most} ways"))
         if self.reading.threshold is None:
-            looks.append(Look(ways=most, lower=True, note=", a lower threshold"))
+            passes.append(Pass(ways=most, lower=True, note=", a lower threshold"))
         if not has_more and self.n_scales == 1 and self._may_be_finer(best):
-            looks += [Look(finer=finer, ways=1, note=", shown alone") for finer in (1.0, _FINER)]
-        return looks + [Look(rank, as_shown=True) for rank in range(1, 1 + self.n_further)]
+            passes += [Pass(finer=finer, ways=1, note=", shown alone") for finer in (1.0, _FINER)]
+        return passes + [Pass(rank, as_shown=True) for rank in range(1, 1 + self.n_further)]
 
-    def look(self, look: Look) -> Seen:
-        """Return the roads seen in one look, on the grid.
+    def roads(self, one: Pass) -> PassRoads:
+        """Return the roads that one pass shows, on the grid.
 
         Raises
         ------
         MaskError
             It shows no roads.
         """
-        scale = look.finer * self.scale(look.rank)
-        seen = self.see(scale, 1 if look.as_shown and self._was_shown_alone(scale) else look.ways)
-        threshold = seen.threshold if self.reading.threshold is None else self.reading.threshold
-        return Seen(f"scale {scale:.3g}{look.note}", seen.mask(spread_probability(threshold)[look.lower]), seen)
+        scale = one.finer * self.scale(one.rank)
+        probability = self.probability(scale, 1 if one.as_shown and self._was_shown_alone(scale) else one.ways)
+        threshold = probability.threshold if self.reading.threshold is None else self.reading.threshold
+        mask = probability.mask(spread_probability(threshold)[one.lower])
+        return PassRoads(f"scale {scale:.3g}{one.note}", mask, probability)
 
-    def see(self, scale: float, ways: int | None) -> ProbabilityMap:
+    def probability(self, scale: float, ways: int | None) -> ProbabilityMap:
         """Return the probability of road on the grid."""
-        return self._see(scale, ways or self.ways).resized(self.grid)
+        return self._probability(scale, ways or self.ways).resized(self.grid)
 
-    def _see(self, scale: float, ways: int) -> ProbabilityMap:
+    def _probability(self, scale: float, ways: int) -> ProbabilityMap:
         """Return what the model sees, not much finer than the grid."""
         if ways > 1 and self._may_be_finer(scale):
-            parts = [self._see(_FINER * scale, ways // 2), self._see(scale, ways - ways // 2)]
-            return mean_of([seen.resized(self.grid) if seen.values.shape[0] > self.grid[0] else seen for seen in parts])
+            parts = [self._probability(_FINER * scale, ways // 2), self._probability(scale, ways - ways // 2)]
+            return mean_of([part.resized(self.grid) if part.values.shape[0] > self.grid[0] else part for part in parts])
         key = (scale, ways)
-        if key not in self._seen or self._seen[key].values.shape[0] >= 2 * self.grid[0]:
+        if key not in self._shown or self._shown[key].values.shape[0] >= 2 * self.grid[0]:
             step = max(1, int(map_shape(self.photograph, scale)[0] / self.grid[0]))
-            self._seen[key] = segment(self.photograph, self.network, scale, self.say, step=step, ways=ways)
-        return self._seen[key]
+            self._shown[key] = segment(self.photograph, self.network, scale, self.say, step=step, ways=ways)
+        return self._shown[key]
 
     def _was_shown_alone(self, scale: float) -> bool:
         """Whether a model was shown the photograph at a scale, and not at the next finer one that it would go with."""
-        shown = {scale for scale, _ in self._seen}
+        shown = {scale for scale, _ in self._shown}
         return scale in shown and not (self._may_be_finer(scale) and _FINER * scale in shown)
 
     def _shape_at(self, scale: float) -> tuple[float, float]:
@@ -201,7 +210,9 @@ class Frame:
 
 
 @contextmanager
-def open_frame(path: str, reading: ReadOptions, gsd_m: tuple[float, float], say: Say) -> Iterator[Frame]:
+def open_segmented(
+    path: str, reading: ReadOptions, gsd_m: tuple[float, float], say: Say
+) -> Iterator[SegmentedPhotograph]:
     """Open a photograph.
 
     Parameters
@@ -217,7 +228,7 @@ def open_frame(path: str, reading: ReadOptions, gsd_m: tuple[float, float], say:
         There is no model, or it cannot be run.
     """
     with open_photograph(path, reading.bands) as photograph:
-        yield Frame(photograph, reading, gsd_m, say)
+        yield SegmentedPhotograph(photograph, reading, gsd_m, say)
 
 
 def locate_photograph(
@@ -233,31 +244,31 @@ def locate_photograph(
     Raises
     ------
     MaskError, ModelError
-        As of `open_frame`.
+        As of `open_segmented`.
     PluginError
         The segmenter fails.
     """
     plugin = plugin_of(reading)
     if plugin:
-        seen = Seen("the segmenter's own threshold", call_segmenter(plugin, path, reading.threshold))
-        return locate_looks([Look()], lambda _: seen, references, options, how)
-    with open_frame(path, reading, options.match.camera.gsd_m, say) as frame:
-        on_grid, looks = _on_grid(options, frame.coarser), frame.looks()
+        roads = PassRoads("the segmenter's own threshold", call_segmenter(plugin, path, reading.threshold))
+        return locate_passes([Pass()], lambda _: roads, references, options, how)
+    with open_segmented(path, reading, options.match.camera.gsd_m, say) as segmented:
+        on_grid, passes = _on_grid(options, segmented.coarser), segmented.passes()
         try:
-            found = locate_looks(looks, frame.look, references, on_grid, how)
+            sighting = locate_passes(passes, segmented.roads, references, on_grid, how)
         except MaskError as error:
-            ways = max((look.ways for look in looks if look.ways), default=None)
-            return _see_hardly_a_road(frame, ways, error, references)
-    sighting = _in_own_pixels(found, frame.own)
+            ways = max((one.ways for one in passes if one.ways), default=None)
+            return _refuse_without_roads(segmented, ways, error, references)
+    sighting = _in_own_pixels(sighting, segmented.own)
     reason = sighting.location.reason.replace(searched_within(on_grid), searched_within(options))
-    return sighting.told(replace(sighting.location, reason=reason)).showing(part=frame.photograph.page)
+    return sighting.answering(replace(sighting.location, reason=reason)).showing(part=segmented.photograph.page)
 
 
-def _see_hardly_a_road(
-    frame: Frame, ways: int | None, error: MaskError, references: Sequence[AnyReference]
+def _refuse_without_roads(
+    segmented: SegmentedPhotograph, ways: int | None, error: MaskError, references: Sequence[AnyReference]
 ) -> Sighting:
-    """Return the refusal of a photograph in which no look shows roads that can be traced."""
-    name, (height, width) = frame.photograph.name, frame.own
+    """Return the refusal of a photograph in which no pass shows roads that can be traced."""
+    name, (height, width) = segmented.photograph.name, segmented.own
     location = Location(
         name,
         "not_located",
@@ -266,8 +277,8 @@ def _see_hardly_a_road(
         content=Content((width, height)),
         reason_code=Reason.FEW_ROADS,
     )
-    seen = frame.see(frame.scale(0), ways).resized(frame.own)
-    return Sighting(location, RoadMask(np.zeros(frame.own, np.bool_), name=name), probability=seen)
+    probability = segmented.probability(segmented.scale(0), ways).resized(segmented.own)
+    return Sighting(location, RoadMask(np.zeros(segmented.own, np.bool_), name=name), probability=probability)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
@@ -285,7 +296,7 @@ def _on_grid(options: LocateOptions, k: float) -> LocateOptions:
 
 
 def _in_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
-    """Return what was found on a finer grid in a photograph's own pixels, (H, W)."""
+    """Return a sighting on a finer grid in a photograph's own pixels, (H, W)."""
     if sighting.mask.shape == own:
         return sighting
     probability = None if sighting.probability is None else sighting.probability.resized(own)
@@ -322,10 +333,10 @@ def call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
     PluginError
         It fails, or returns something else.
     """
-    seen = call_plugin(SEGMENTERS, name, path)
-    if isinstance(seen, RoadMask):
-        return replace(seen, name=os.fspath(path))
-    if not isinstance(seen, np.ndarray):
-        kind = type(seen).__name__
+    roads = call_plugin(SEGMENTERS, name, path)
+    if isinstance(roads, RoadMask):
+        return replace(roads, name=os.fspath(path))
+    if not isinstance(roads, np.ndarray):
+        kind = type(roads).__name__
         raise PluginError(f"the segmenter {name!r} returned a {kind}, expected a RoadMask or an array")
-    return read_mask(seen, threshold=threshold, name=os.fspath(path))
+    return read_mask(roads, threshold=threshold, name=os.fspath(path))

@@ -20,9 +20,9 @@ from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, swapped_near
-from roadgeo.running.looks import Locate, Seen, Sighting, locate_looks
 from roadgeo.running.options import ReadOptions
-from roadgeo.running.photographs import Look, call_segmenter, locate_photograph, open_frame, plugin_of
+from roadgeo.running.passes import Locate, PassRoads, Sighting, locate_passes
+from roadgeo.running.photographs import Pass, call_segmenter, locate_photograph, open_segmented, plugin_of
 from roadgeo.running.pictures import as_file
 from roadgeo.running.variants import undoing
 from roadgeo.sources.drawn_roads import draw_roads
@@ -32,7 +32,7 @@ from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS
 from roadgeo.workflows import locate
 
-__all__ = ["FirstLook", "locate_query", "look_once"]
+__all__ = ["QueryRoads", "locate_query", "read_roads"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,7 +73,9 @@ def locate_query(
 
     sighting = _look_at(path, references, options, reading, upright, say)
     if reading.mirror is None and stated()[1]:
-        sighting = sighting.told(sighting.location.saying("the georeference of the file mirrors it, which was undone"))
+        sighting = sighting.answering(
+            sighting.location.saying("the georeference of the file mirrors it, which was undone")
+        )
     return sighting
 
 
@@ -88,18 +90,18 @@ def _look_at(
     """Locate a mask, or a photograph."""
     with _open_as_mask(path, reading) as mask:
         if mask is not None:
-            sighting = locate_looks(mask.thresholds, _looks_at(mask), references, options, how)
+            sighting = locate_passes(mask.thresholds, _looks_at(mask), references, options, how)
             return sighting.showing(part=mask.part)
     with as_file(path) as file:
         sighting = locate_photograph(file, references, options, reading, how, say)
         if not isinstance(path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
-            sighting = sighting.told(replace(sighting.location, query=_ARRAY, reason=reason))
+            sighting = sighting.answering(replace(sighting.location, query=_ARRAY, reason=reason))
     return replace(sighting, of_photograph=True)
 
 
 @dataclass(frozen=True)
-class FirstLook:
+class QueryRoads:
     """The roads seen in a query before it is compared with any map.
 
     Attributes
@@ -118,10 +120,10 @@ class FirstLook:
     of_photograph: bool = False
 
 
-def look_once(
+def read_roads(
     path: str | AnyArray, gsd_m: tuple[float, float] | None, reading: ReadOptions, say: Say = say_nothing
-) -> FirstLook:
-    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as its first look.
+) -> QueryRoads:
+    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as in its first pass.
 
     Parameters
     ----------
@@ -136,18 +138,18 @@ def look_once(
     """
     with _open_as_mask(path, reading) as mask:
         if mask is not None:
-            return FirstLook(mask.read(mask.thresholds[0]))
+            return QueryRoads(mask.read(mask.thresholds[0]))
     with as_file(path) as file:
         plugin = plugin_of(reading)
         if plugin:
-            return FirstLook(call_segmenter(plugin, file, reading.threshold), of_photograph=True)
-        with open_frame(file, reading, gsd_m or CameraOptions().gsd_m, say) as frame:
-            seen = frame.see(frame.scale(0), None)
+            return QueryRoads(call_segmenter(plugin, file, reading.threshold), of_photograph=True)
+        with open_segmented(file, reading, gsd_m or CameraOptions().gsd_m, say) as segmented:
+            probability = segmented.probability(segmented.scale(0), None)
             try:
-                roads = frame.look(Look()).mask
+                roads = segmented.roads(Pass()).mask
             except MaskError:  # the roads seen are worth a look all the same
-                roads = RoadMask(np.zeros(frame.grid, np.bool_), name=file)
-            return FirstLook(roads, frame.coarser, seen.resized(frame.own), of_photograph=True)
+                roads = RoadMask(np.zeros(segmented.grid, np.bool_), name=file)
+            return QueryRoads(roads, segmented.coarser, probability.resized(segmented.own), of_photograph=True)
 
 
 @contextmanager
@@ -185,9 +187,9 @@ def _is_photograph(path: str | AnyArray) -> bool:
         return isinstance(error, PhotographError)
 
 
-def _looks_at(mask: MaskSource) -> Callable[[float], Seen]:
+def _looks_at(mask: MaskSource) -> Callable[[float], PassRoads]:
     """Return what shows a mask at a threshold."""
-    return lambda threshold: Seen(f"threshold {threshold:.3g}", mask.read(threshold))
+    return lambda threshold: PassRoads(f"threshold {threshold:.3g}", mask.read(threshold))
 
 
 def _locate_lines(
@@ -202,5 +204,5 @@ def _locate_lines(
         tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map
         camera = replace(camera, gsd_m=known, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
     options = replace(options, match=replace(options.match, camera=camera))
-    sighting = locate_looks([drawing.mask], lambda mask: Seen("its lines", mask), references, options, how)
+    sighting = locate_passes([drawing.mask], lambda mask: PassRoads("its lines", mask), references, options, how)
     return sighting.showing(lines_to_pixels=drawing.to_pixel)

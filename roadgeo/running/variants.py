@@ -22,7 +22,7 @@ from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference
-from roadgeo.running.looks import Locate
+from roadgeo.running.passes import Locate
 
 __all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "undoing"]
 

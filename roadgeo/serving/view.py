@@ -30,7 +30,7 @@ from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
 from roadgeo.outputs.subject import Subject, ViewOptions
 from roadgeo.reference.opening import AnyReference
-from roadgeo.running.looks import Sighting
+from roadgeo.running.passes import Sighting
 from roadgeo.storage.files import replacing
 
 __all__ = [

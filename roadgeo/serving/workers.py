@@ -250,7 +250,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
         sighting = locate_query(image, references, options, query, how=search, say=tell)
         sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     if taken is not None:
-        sighting = sighting.told(take_place(sighting.location, taken, options))
+        sighting = sighting.answering(take_place(sighting.location, taken, options))
     location = replace(sighting.location, query=request.name)
     location = replace(location, reason=_without(request.path, _without(str(seen), location.reason)))
     lacks_view = False

@@ -84,16 +84,16 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, int]]:
 
 
 @pytest.mark.parametrize(("segmenter", "ways"), [("", True), ("model", True), ("plugin", False)])
-def test_the_second_look_shows_the_photograph_more_ways(
+def test_the_second_pass_shows_the_photograph_more_ways(
     segmenter: str, ways: bool, model: str, photo: Path, shown: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[str] = []
 
-    def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.note for look in looks if look.rank == 0)
+    def note(passes, *_):  # type: ignore[no-untyped-def]
+        taken.extend(one.note for one in passes if one.rank == 0)
         raise MaskError("that is all")
 
-    monkeypatch.setattr(photographs, "locate_looks", note)
+    monkeypatch.setattr(photographs, "locate_passes", note)
     mask = RoadMask(np.zeros((10, 10), np.bool_))
     monkeypatch.setattr(photographs, "call_segmenter", lambda *_: mask)
     query = ReadOptions(segment="always", segmenter=model if segmenter == "model" else segmenter)
@@ -120,7 +120,7 @@ def light(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(("ways", "expected"), [(1, [(0.5, 1)]), (2, [(1.0, 1), (0.5, 1)])])
-def test_the_first_look_shows_the_photograph_in_two_ways_to_the_model_that_ships(
+def test_the_first_pass_shows_the_photograph_in_two_ways_to_the_model_that_ships(
     tmp_path: Path,
     photo: Path,
     shown: list[tuple[float, int]],
@@ -132,7 +132,7 @@ def test_the_first_look_shows_the_photograph_in_two_ways_to_the_model_that_ships
     if ways == 2:
         monkeypatch.setattr(photographs, "DEFAULT_MODEL", model)
     segmenter = "" if ways == 2 else str(model)
-    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenter=segmenter))
+    queries.read_roads(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenter=segmenter))
     photographs.load_model.cache_clear()
     assert shown == expected
 
@@ -143,14 +143,14 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
     monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
     taken: list[str] = []
 
-    def take(looks, see, *_):  # type: ignore[no-untyped-def]
-        for look in looks:
-            taken.append(f"{look.rank}{look.note}")
+    def take(passes, see, *_):  # type: ignore[no-untyped-def]
+        for one in passes:
+            taken.append(f"{one.rank}{one.note}")
             with suppress(MaskError):
-                see(look)
+                see(one)
         raise MaskError("that is all")
 
-    monkeypatch.setattr(photographs, "locate_looks", take)
+    monkeypatch.setattr(photographs, "locate_passes", take)
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: NOTHING, 1.0: None, 2.0: None})
     locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always"))
     photographs.load_model.cache_clear()
@@ -166,28 +166,30 @@ def test_a_scale_that_was_tried_alone_is_not_shown_finer(
     monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: dict.fromkeys((0.5, 0.25, 0.125), NOTHING))
     reading = ReadOptions(segment="always")
-    with photographs.open_frame(str(photo), reading, (0.0, np.inf), lambda *_: None) as frame:
-        for look in frame.looks():
+    with photographs.open_segmented(str(photo), reading, (0.0, np.inf), lambda *_: None) as segmented:
+        for one in segmented.passes():
             with suppress(MaskError):
-                frame.look(look)
+                segmented.roads(one)
     photographs.load_model.cache_clear()
     assert not shown
 
 
-def test_a_told_scale_takes_no_scale_from_the_looks_of_a_photograph_whose_scale_is_unknown(
+def test_a_told_scale_takes_no_scale_from_the_passes_of_a_photograph_whose_scale_is_unknown(
     tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It says how large the ground is, not at which scale the model sees it best; it comes first."""
     monkeypatch.setattr(photographs, "DEFAULT_MODEL", light(tmp_path))
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: {1.0: NOTHING, 0.5: NOTHING, 2.0: None})
     monkeypatch.setattr(photographs, "try_scales", lambda *_: (0.5, 1.0, 2.0))
-    with photographs.open_frame(str(photo), ReadOptions(segment="always"), (0.95, 1.05), lambda *_: None) as frame:
-        looks = frame.looks()
-        assert [look.rank for look in looks[-frame.n_further :]] == [1, 2, 3]
-        assert {look.rank for look in looks[: -frame.n_further]} == {0}
-        told, *further = [frame.scale(rank) for rank in range(4)]
+    with photographs.open_segmented(
+        str(photo), ReadOptions(segment="always"), (0.95, 1.05), lambda *_: None
+    ) as segmented:
+        passes = segmented.passes()
+        assert [one.rank for one in passes[-segmented.n_further :]] == [1, 2, 3]
+        assert {one.rank for one in passes[: -segmented.n_further]} == {0}
+        told, *further = [segmented.scale(rank) for rank in range(4)]
     photographs.load_model.cache_clear()
-    assert told == pytest.approx(photographs.scale_of(1.0, frame.network), rel=0.01)
+    assert told == pytest.approx(photographs.scale_of(1.0, segmented.network), rel=0.01)
     assert further == [1.0, 0.5, 2.0]
 
 
@@ -279,7 +281,7 @@ def test_no_scale_is_looked_for_in_vain(
     calls.clear()
     small = cv2.imread(str(photo))[:480, :480]
     cv2.imwrite(str(photo.with_name("small.png")), small)
-    queries.look_once(str(photo.with_name("small.png")), None, query)
+    queries.read_roads(str(photo.with_name("small.png")), None, query)
     assert calls == (["ranked"] if stated is None else ["shown"])
 
 
@@ -312,20 +314,20 @@ def test_what_is_seen_is_shown_without_a_map(
 
 def test_a_threshold_makes_no_mask_of_a_photograph(photo: Path, model: str) -> None:
     reading = ReadOptions(threshold=0.4, segmenter=model)
-    assert queries.look_once(str(photo), (0.6, 1.0), reading).probability is not None
-    assert queries.look_once(str(DRONE), None, reading).probability is None
+    assert queries.read_roads(str(photo), (0.6, 1.0), reading).probability is not None
+    assert queries.read_roads(str(DRONE), None, reading).probability is None
     as_mask = replace(reading, threshold=200.0, segment="never")
-    assert queries.look_once(str(photo), None, as_mask).probability is None
+    assert queries.read_roads(str(photo), None, as_mask).probability is None
 
 
 def test_what_plugins_and_masks_show(
     tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(photographs, "call_plugin", lambda *_: cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE))
-    seen = queries.look_once(str(photo), None, ReadOptions(segmenter="plugin"))
+    seen = queries.read_roads(str(photo), None, ReadOptions(segmenter="plugin"))
     assert seen.probability is None
     assert seen.coarser == 1.0
-    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(DRONE), None, ReadOptions()).mask.roads)
+    np.testing.assert_array_equal(seen.mask.roads, queries.read_roads(str(DRONE), None, ReadOptions()).mask.roads)
     assert main(["vectorize", str(photo), "--segment", "never", "-o", str(tmp_path)]) == 1
     assert "looks like a photograph" in capsys.readouterr().err
     given = ["vectorize", str(photo), "-o", str(tmp_path), "--segmenter", model]

@@ -23,7 +23,7 @@ import pytest
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Content, Location
 from roadgeo.reference.reference import Reference
-from roadgeo.running.looks import Sighting
+from roadgeo.running.passes import Sighting
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server

@@ -32,7 +32,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Content, Location
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
-from roadgeo.running.looks import Sighting
+from roadgeo.running.passes import Sighting
 from roadgeo.running.pool import Died
 from roadgeo.serving.workers import ImageRequest, Serving, Workers, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap

@@ -1,4 +1,4 @@
-"""Several looks share the limits of one search, and each costs its part of the odds."""
+"""Several passes share the limits of one search, and each costs its part of the odds."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Spent, Stats
 from roadgeo.matching.options import LocateOptions
-from roadgeo.running.looks import Seen, locate_looks
+from roadgeo.running.passes import PassRoads, locate_passes
 
 OPTIONS = LocateOptions()
 MASK = RoadMask(np.eye(40, dtype=bool))
@@ -21,7 +21,7 @@ def found(status="located", odds=9.0, east_m=0.0, seconds=1.0):
 
 
 def take(*answers, options=OPTIONS):
-    """Locate looks whose answers are given; return the sighting and the limits of work that were set."""
+    """Locate passes whose answers are given; return the sighting and the limits of work that were set."""
     limits, left = [], list(answers)
 
     def how(mask, references, options):
@@ -31,31 +31,31 @@ def take(*answers, options=OPTIONS):
             raise answer
         return answer
 
-    looks = range(len(answers))
-    return locate_looks(looks, lambda i: Seen(f"look {i}", MASK), [], options, how).location, limits
+    passes = range(len(answers))
+    return locate_passes(passes, lambda i: PassRoads(f"pass {i}", MASK), [], options, how).location, limits
 
 
-def test_the_first_look_that_is_located_is_the_answer():
+def test_the_first_pass_that_is_located_is_the_answer():
     location, limits = take(found(), found(odds=30.0))
     assert location.log10_odds == 9.0
     assert location.reason == "why"
     assert limits == [6.0]
 
 
-def test_a_single_look_has_all_the_time():
+def test_a_single_pass_has_all_the_time():
     assert take(found())[1] == [10.0]
 
 
-def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
+def test_each_pass_costs_its_part_of_the_odds_and_of_the_time():
     location, limits = take(found("not_located"), MaskError("no road"), found(odds=9.0))
     assert location.status == "located"
     assert location.log10_odds == pytest.approx(9 - np.log10(3))
     assert location.places[0].score == location.log10_odds
-    assert "its roads were traced in 3 ways, here at look 2" in location.reason
+    assert "its roads were traced in 3 ways, here at pass 2" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
 
 
-def test_what_is_too_unlikely_for_a_second_look_is_refused():
+def test_what_is_too_unlikely_for_a_second_pass_is_refused():
     location, _ = take(MaskError("no road"), found(odds=OPTIONS.min_log10_odds + 0.2))
     assert location.status == "not_located"
     assert location.center is None
@@ -63,13 +63,13 @@ def test_what_is_too_unlikely_for_a_second_look_is_refused():
     assert "not clearly enough" in location.reason
 
 
-def test_no_look_is_taken_when_the_time_is_gone():
+def test_no_pass_is_taken_when_the_time_is_gone():
     location, limits = take(found("not_located", seconds=9.8), found())
     assert location.status == "not_located"
     assert len(limits) == 1
 
 
-def test_two_looks_at_two_places_are_ambiguous():
+def test_two_passes_at_two_places_are_ambiguous():
     location, _ = take(found("ambiguous", odds=10.0, east_m=30_000.0), found(odds=9.0))
     assert location.status == "ambiguous"
     assert location.runner_up.center.x == pytest.approx(location.center.x + 30_000.0)
@@ -78,7 +78,7 @@ def test_two_looks_at_two_places_are_ambiguous():
     assert same.status == "located"
 
 
-def test_looks_that_show_nothing_raise_the_first_reason():
+def test_passes_that_show_nothing_raise_the_first_reason():
     with pytest.raises(MaskError, match="first"):
         take(MaskError("first"), MaskError("second"))
     with pytest.raises(MaskError, match="nothing to look at"):

@@ -1,7 +1,7 @@
-"""Several looks at one scene: a soft map at several thresholds, a photograph at several scales.
+"""Several passes over one scene: a soft map at several thresholds, a photograph at several scales.
 
-Each look is a mask of its own and is located by `workflows.locate`. All share the limits of one search. Who looks k
-times finds a chance resemblance k times as often, so log10(k) is taken off the odds.
+Each pass is a mask of its own and is located by `workflows.locate`. All share the limits of one search. A search of k
+passes finds a chance resemblance k times as often, so log10(k) is taken off the odds.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
-__all__ = ["Locate", "Seen", "Sighting", "locate_looks", "total_seconds"]
+__all__ = ["Locate", "PassRoads", "Sighting", "locate_passes", "total_seconds"]
 
-#: Share of the work left that a look may take; the last one may take all.
+#: Share of the work left that a pass may take; the last one may take all.
 _SHARE = 0.6
-#: Score by which a place must lead one that another look found elsewhere.
+#: Score by which a place must lead one that another pass found elsewhere.
 _LEAST_LEAD = 2.0
 
 Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location | Explanation"]
@@ -37,13 +37,13 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Seen:
-    """The roads that one look shows.
+class PassRoads:
+    """The roads that one pass shows.
 
     Attributes
     ----------
     what : str
-        The look's name among the others, for people: "threshold 63".
+        The pass's name among the others, for people: "threshold 63".
     probability : ProbabilityMap, optional
         What a segmenter saw, where the mask is made of that.
     """
@@ -55,7 +55,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Sighting:
-    """The answer of the best look, and the mask that it rests on."""
+    """The answer of the best pass, and the mask that it rests on."""
 
     location: Location
     mask: RoadMask
@@ -63,56 +63,56 @@ class Sighting:
     probability: ProbabilityMap | None = None
     of_photograph: bool = False
 
-    def told(self, location: Location) -> Sighting:
+    def answering(self, location: Location) -> Sighting:
         """Return it with another answer."""
         return replace(self, location=location)
 
     def showing(self, **content: Any) -> Sighting:
         """Return it with more of the image's content (see `location.Content`)."""
         shown = self.location.content or Content(self.mask.shape[::-1])
-        return self.told(replace(self.location, content=replace(shown, **content)))
+        return self.answering(replace(self.location, content=replace(shown, **content)))
 
 
-def locate_looks(
-    looks: Sequence[T],
-    look: Callable[[T], Seen],
+def locate_passes(
+    passes: Sequence[T],
+    show: Callable[[T], PassRoads],
     references: Sequence[AnyReference],
     options: LocateOptions,
     how: Locate,
 ) -> Sighting:
-    """Take one look after another until a mask is located, within the limits of one search.
+    """Take one pass after another until a mask is located, within the limits of one search.
 
     Parameters
     ----------
-    looks : sequence
+    passes : sequence
         What distinguishes them, such as thresholds, the most promising first.
-    look : callable
+    show : callable
         Takes one of them; may raise MaskError.
 
     Raises
     ------
     MaskError
-        No look shows roads that can be traced; the first one's reason.
+        No pass shows roads that can be traced; the first one's reason.
     """
     sightings: list[Sighting] = []
     failure: MaskError | None = None
     work_left, time_left = options.search.work_limit_s, options.search.time_limit_s
-    for tried, which in enumerate(looks, 1):
+    for tried, which in enumerate(passes, 1):
         if tried > 1 and (work_left <= 0.05 * options.search.work_limit_s or time_left <= 0.0):
             break
-        share = 1.0 if tried == len(looks) else _SHARE
+        share = 1.0 if tried == len(passes) else _SHARE
         try:
-            seen = look(which)
-            found = how(seen.mask, references, _limited(options, share * work_left, time_left))
+            roads = show(which)
+            answer = how(roads.mask, references, _limited(options, share * work_left, time_left))
         except MaskError as error:
             failure = failure or error
             continue
-        explanation, location = (found, found.location) if isinstance(found, Explanation) else (None, found)
+        explanation, location = (answer, answer.location) if isinstance(answer, Explanation) else (None, answer)
         seconds = location.seconds
         work_left -= location.spent.stats.work_ms / 1000
         time_left -= seconds.vectorize + seconds.match + seconds.refine
-        location = _discount(location, seen.what, tried, options)
-        sightings.append(Sighting(location, seen.mask, explanation, seen.probability))
+        location = _discount(location, roads.what, tried, options)
+        sightings.append(Sighting(location, roads.mask, explanation, roads.probability))
         if sightings[-1].location.located:
             break
     if not sightings:
@@ -126,7 +126,7 @@ def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -
 
 
 def _discount(location: Location, what: str, tried: int, options: LocateOptions) -> Location:
-    """Take log10 of the number of looks off the scores; a place that then scores too little is not located."""
+    """Take log10 of the number of passes off the scores; a place that then scores too little is not located."""
     if tried == 1 or location.log10_odds is None:
         return location
     places = tuple(_less_sure(place, math.log10(tried)) for place in location.places)
@@ -138,7 +138,7 @@ def _discount(location: Location, what: str, tried: int, options: LocateOptions)
 
 
 def _in_ways(tried: int) -> str:
-    """Count the looks, as every reason does."""
+    """Count the passes, as every reason does."""
     return f"its roads were traced in {tried} ways"
 
 
