@@ -146,9 +146,11 @@ class Fence:
         return True
 
     def _prepare(self) -> None:
-        """Make the folders that are to be written, temporary ones too; lookups elsewhere are settled here."""
+        """Make the folders that are to be written, temporary ones too; settle what libraries look up elsewhere."""
         with contextlib.suppress(RuntimeError):
             os.environ.setdefault("HOME", str(Path.home()))  # else the system's list of users is read
+        # Arrow's usual pool reserves 1 GB at once: all that the reading of a small file may take (`storage.memory`).
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
         for folder in (path for path in self.write if not Path(path).is_file()):
             with contextlib.suppress(OutputError):  # whoever writes there will report it
                 make_folder(folder)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
@@ -122,6 +123,18 @@ def test_few_bytes_that_stand_for_many_end_in_a_line(which: str, message: str, t
     said, megabytes = done.stdout.strip().splitlines()
     assert re.search(message, said)
     assert int(megabytes) < 1500
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not abi_version(), reason="only inside a fence, which this system has not")
+def test_a_small_file_is_read_within_its_bound(tmp_path: Path) -> None:
+    """Arrow's usual allocator reserves 1 GB, as much as a small file may take."""
+    lines = shapely.linestrings(np.random.default_rng(1).uniform(0.0, 1.0, (20_000, 2, 2)))
+    columns = {"highway": ["residential"] * len(lines)}
+    gpd.GeoDataFrame(columns, geometry=lines, crs=4326).to_parquet(tmp_path / "roads.parquet")
+    command = [sys.executable, "-c", READ, str(tmp_path / "roads.parquet")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert int(done.stdout) < 1500
 
 
 def test_the_bound_goes_with_the_file_and_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
