@@ -167,24 +167,29 @@ def draw_masks(folder: Path, asked: Sequence[Asked]) -> list[Asked]:
     return drawn
 
 
-def draw(landscape: Any, path: Path, kind: str, how: str, k: int) -> dict[str, Any] | None:
-    """Draw one mask and write it; return its truth, or None where the city has no such place."""
-    from roadgeo.errors import RoadSourceError
+def options_of(kind: str, how: str = "", seed: int = SEED) -> Any:
+    """Return the options of `simulate_query` for masks of a kind."""
     from roadgeo.evaluation.noise import NoiseModel
-    from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
-    from roadgeo.evaluation.truth import truth_to_record
+    from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 
     view = ViewOptions(
         (1500, 1500), gsd_m=(0.8, 1.25), tilt_deg=(0.0, 20.0), heading_deg=(0.0, 360.0), focal_px=1500.0,
         intersections=(25, 1_000_000), road_width_m=(8.0, 10.0),
     )  # fmt: skip
     noise = NoiseModel((0.08, 0.12), (0.03, 0.05), warp_px=0.8, raggedness=0.12)
+    view, noise = replace(view, **KINDS[kind].view), replace(noise, **KINDS[kind].noise)
+    return SimulationOptions(view, noise, kind + how, seed, how == "turned over")
+
+
+def draw(landscape: Any, path: Path, kind: str, how: str, k: int) -> dict[str, Any] | None:
+    """Draw one mask and write it; return its truth, or None where the city has no such place."""
+    from roadgeo.errors import RoadSourceError
+    from roadgeo.evaluation.simulation import simulate_query
+    from roadgeo.evaluation.truth import truth_to_record
+
     chosen = KINDS[kind]
-    options = SimulationOptions(
-        replace(view, **chosen.view), replace(noise, **chosen.noise), kind + how, SEED, how == "turned over"
-    )
     try:
-        query = simulate_query(landscape, options, k)
+        query = simulate_query(landscape, options_of(kind, how), k)
     except RoadSourceError:
         return None
     mask = query.mask

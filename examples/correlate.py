@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import geopandas as gpd
 import numpy as np
+import shapely
 from scipy import fft
 
 import roadgeo
@@ -40,32 +41,47 @@ KINDS = {
 class DrawnMap:
     """The map's roads as a raster, and its spectrum."""
 
-    def __init__(self, roads: gpd.GeoDataFrame, side: int) -> None:
-        """Draw them; `side` is the largest template's, in cells."""
-        self.west, south, east, self.north = roads.total_bounds
+    def __init__(self, lines: np.ndarray, side: int) -> None:
+        """Draw shapely lines, in metres; `side` is the largest template's, in cells."""
+        self.west, south, east, self.north = shapely.total_bounds(lines)
         rows, columns = (int(length / CELL_M) + side for length in (self.north - south, east - self.west))
         self.shape = cv2.getOptimalDFTSize(rows + side), cv2.getOptimalDFTSize(columns + side)
         drawn = np.zeros(self.shape, np.uint8)
-        for line in roads.geometry.explode().array:
-            at = np.array(line.coords)[:, :2]
+        for line in shapely.get_parts(lines):
+            at = shapely.get_coordinates(line)
             cells = np.stack([at[:, 0] - self.west, self.north - at[:, 1]], axis=1) / CELL_M + side / 2
             cv2.polylines(drawn, [np.round(cells).astype(np.int32)], False, 1, round(ROAD_M / CELL_M))
         self.side, self.spectrum = side, fft.rfft2(drawn.astype(np.float32))
 
-    def find(self, template: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
-        """Return x, y of the middle where the correlation on the seen ground is greatest."""
+    def find(
+        self, template: np.ndarray, seen: np.ndarray, except_at: tuple[float, float, float] | None = None
+    ) -> tuple[float, float]:
+        """Return x, y of the middle where the correlation on the seen ground is greatest.
+
+        Middles in the circle `except_at` (x, y, radius; metres) are left out.
+        """
         n = seen.sum()
         centred = np.where(seen, template - template[seen].mean(), 0.0).astype(np.float32)
         both = self._correlate(centred)
         total = self._correlate(seen.astype(np.float32))
         spread = np.sqrt(np.maximum(total - total**2 / n, 1.0))  # of zeros and ones: the sum of squares is the sum
-        row, column = np.unravel_index(np.argmax(both / spread), both.shape)
+        correlation = both / spread
+        if except_at is not None:
+            x, y, radius = except_at
+            at = round((x - self.west) / CELL_M - 0.5), round((self.north - y) / CELL_M - 0.5)
+            cv2.circle(correlation, at, round(radius / CELL_M), -np.inf, cv2.FILLED)
+        row, column = np.unravel_index(np.argmax(correlation), correlation.shape)
         return self.west + (column + 0.5) * CELL_M, self.north - (row + 0.5) * CELL_M
 
     def _correlate(self, template: np.ndarray) -> np.ndarray:
         product = self.spectrum * np.conj(fft.rfft2(template, self.shape))
         inside = self.shape[0] - self.side, self.shape[1] - self.side
         return np.asarray(fft.irfft2(product, self.shape))[: inside[0], : inside[1]]
+
+
+def side_of(size_px: int, gsd_m: float) -> int:
+    """Return the side of a template, in cells, that holds a square mask at any heading."""
+    return int(size_px * gsd_m * np.sqrt(2) / CELL_M) + 2
 
 
 def turn_north(mask: np.ndarray, truth: Truth, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,8 +108,8 @@ def main(arguments: list[str] | None = None) -> None:
     landscape = Landscape.from_lines(read.lines, read.plane)
     reference = roadgeo.index(options.roads)
     crs = simulate_query(landscape, SimulationOptions(LEVEL), 0).truth.crs
-    side = int(1.25 * 1000 * np.sqrt(2) / CELL_M) + 2
-    drawn = DrawnMap(gpd.read_file(options.roads).to_crs(crs), side)
+    side = side_of(1000, 1.25)
+    drawn = DrawnMap(gpd.read_file(options.roads).to_crs(crs).geometry.to_numpy(), side)
     print("| | correlation, heading and scale given | roadgeo, blind | wrong | seconds, each |")
     print("|---|---|---|---|---|")
     for kind, (view, noise) in KINDS.items():
