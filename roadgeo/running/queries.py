@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache
+from typing import Literal
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import visible
-from roadgeo.errors import MaskError, PhotographError
+from roadgeo.errors import MaskError
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
-from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, swapped_near
 from roadgeo.running.options import ReadOptions
@@ -27,7 +25,7 @@ from roadgeo.running.pictures import as_file
 from roadgeo.running.variants import undoing
 from roadgeo.sources.drawn_roads import draw_roads
 from roadgeo.sources.georeference import read_pixel_shape
-from roadgeo.sources.masks import MaskSource, open_mask
+from roadgeo.sources.masks import MaskSource, is_photograph, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS
 from roadgeo.workflows import locate
@@ -61,40 +59,80 @@ def locate_query(
         A segmenter fails.
     """
     options, reading = options or LocateOptions(), reading or ReadOptions()
-    if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
-        return _locate_lines(path, references, options, reading, undoing(how, None, bool(reading.mirror)))
-    stated = cache(lambda: read_pixel_shape(path) if isinstance(path, str) else (None, False))
-
-    def upright(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
-        aspect, is_mirrored = stated()  # now that the file was found to be a picture
-        aspect = aspect if reading.aspect is None else reading.aspect
-        mirror = is_mirrored if reading.mirror is None else reading.mirror
-        return undoing(how, aspect, mirror)(mask, references, options)
-
-    sighting = _look_at(path, references, options, reading, upright, say)
-    if reading.mirror is None and stated()[1]:
-        sighting = sighting.answering(
-            sighting.location.saying("the georeference of the file mirrors it, which was undone")
-        )
+    with open_query(path, reading) as query:
+        how = undoing(how, query.aspect, query.mirrored)
+        sighting = _locate(query, references, options, reading, how, say)
+    if query.mirrored and reading.mirror is None:
+        location = sighting.location.saying("the georeference of the file mirrors it, which was undone")
+        sighting = sighting.answering(location)
     return sighting
 
 
-def _look_at(
-    path: str | AnyArray,
+@dataclass(frozen=True)
+class OpenQuery:
+    """A path or an array, and what it holds.
+
+    Attributes
+    ----------
+    kind : "lines", "mask" or "photograph"
+        A map of probability is a mask.
+    aspect : float or None
+        How many times a pixel is as wide as high; None: once.
+    mirrored : bool
+    mask : MaskSource or None
+        The mask, open.
+    """
+
+    path: str | AnyArray
+    kind: Literal["lines", "mask", "photograph"]
+    aspect: float | None = None
+    mirrored: bool = False
+    mask: MaskSource | None = None
+
+
+@contextmanager
+def open_query(path: str | AnyArray, reading: ReadOptions) -> Iterator[OpenQuery]:
+    """Look what a path or an array holds: roads as lines by its ending, a mask or a photograph by its values.
+
+    Raises
+    ------
+    MaskError
+        It cannot be read, or is a photograph where only masks are asked for.
+    """
+    if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
+        yield OpenQuery(path, "lines", mirrored=bool(reading.mirror))
+        return
+    by_values = reading.may_be_mask and not (_is_chosen_by_values(reading) and is_photograph(path))
+    with open_mask(path, choice=reading.choice, threshold=reading.threshold) if by_values else nullcontext() as mask:
+        if mask is not None and mask.photograph and reading.segment == "auto":
+            mask = None
+        aspect, mirrored = read_pixel_shape(path) if isinstance(path, str) else (None, False)
+        yield OpenQuery(
+            path,
+            "photograph" if mask is None else "mask",
+            aspect if reading.aspect is None else reading.aspect,
+            mirrored if reading.mirror is None else reading.mirror,
+            mask,
+        )
+
+
+def _locate(
+    query: OpenQuery,
     references: Sequence[AnyReference],
     options: LocateOptions,
     reading: ReadOptions,
     how: Locate,
     say: Say,
 ) -> Sighting:
-    """Locate a mask, or a photograph."""
-    with _open_as_mask(path, reading) as mask:
-        if mask is not None:
-            sighting = locate_passes(mask.thresholds, _looks_at(mask), references, options, how)
-            return sighting.showing(part=mask.part)
-    with as_file(path) as file:
+    """Locate what a query holds."""
+    if query.kind == "lines":
+        return _locate_lines(str(query.path), references, options, reading, how)
+    if query.mask is not None:
+        sighting = locate_passes(query.mask.thresholds, _roads_at(query.mask), references, options, how)
+        return sighting.showing(part=query.mask.part)
+    with as_file(query.path) as file:
         sighting = locate_photograph(file, references, options, reading, how, say)
-        if not isinstance(path, str):
+        if not isinstance(query.path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
             sighting = sighting.answering(replace(sighting.location, query=_ARRAY, reason=reason))
     return replace(sighting, of_photograph=True)
@@ -136,9 +174,9 @@ def read_roads(
     MaskError, ModelError, PluginError
         As of `locate_query`.
     """
-    with _open_as_mask(path, reading) as mask:
-        if mask is not None:
-            return QueryRoads(mask.read(mask.thresholds[0]))
+    with open_query(path, reading) as query:
+        if query.mask is not None:
+            return QueryRoads(query.mask.read(query.mask.thresholds[0]))
     with as_file(path) as file:
         plugin = plugin_of(reading)
         if plugin:
@@ -152,42 +190,13 @@ def read_roads(
             return QueryRoads(roads, segmented.coarser, probability.resized(segmented.own), of_photograph=True)
 
 
-@contextmanager
-def _open_as_mask(path: str | AnyArray, reading: ReadOptions) -> Iterator[MaskSource | None]:
-    """Open a mask, or a soft map of roads; None where the path holds a photograph.
-
-    Raises
-    ------
-    MaskError
-        It cannot be read, or is a photograph where only masks are asked for.
-    """
-    with ExitStack() as stack:
-        source = None
-        if reading.may_be_mask and not (_is_chosen_by_values(reading) and _is_photograph(path)):
-            try:
-                source = stack.enter_context(open_mask(path, choice=reading.choice, threshold=reading.threshold))
-            except PhotographError:
-                if reading.segment == "never":
-                    raise
-        yield source
-
-
 def _is_chosen_by_values(reading: ReadOptions) -> bool:
     """Whether values decide what a path holds, though a threshold or a class is given."""
     is_read = reading.threshold is not None or reading.choice.road_class is not None
     return reading.segment == "auto" and is_read and reading.band is None
 
 
-def _is_photograph(path: str | AnyArray) -> bool:
-    """Whether the values of a path look like a photograph's."""
-    try:
-        with open_mask(path):
-            return False
-    except MaskError as error:
-        return isinstance(error, PhotographError)
-
-
-def _looks_at(mask: MaskSource) -> Callable[[float], PassRoads]:
+def _roads_at(mask: MaskSource) -> Callable[[float], PassRoads]:
     """Return what shows a mask at a threshold."""
     return lambda threshold: PassRoads(f"threshold {threshold:.3g}", mask.read(threshold))
 

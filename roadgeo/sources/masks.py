@@ -33,7 +33,7 @@ from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.bands import Choice, Raster, open_bands
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
 
-__all__ = ["MaskSource", "open_mask", "read_mask"]
+__all__ = ["MaskSource", "is_photograph", "open_mask", "read_mask"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -102,6 +102,8 @@ class MaskSource:
         Those worth trying, the most promising first; one for a mask.
     part : str
         What is read of a raster that holds more, for people: "band 2 (road) of 3"; "" where all bands are alike.
+    photograph : str
+        Why it looks like a photograph, which cannot be read as a mask; "" for a mask.
     """
 
     thresholds: tuple[float, ...]
@@ -110,6 +112,7 @@ class MaskSource:
     _voids: bool
     _levels: tuple[float, float] | None  # a soft map's values of ground and of road
     part: str = ""
+    photograph: str = ""
 
     def read(self, threshold: float) -> RoadMask:
         """Read where values lie above a threshold as road.
@@ -117,8 +120,10 @@ class MaskSource:
         Raises
         ------
         MaskError
-            There are no roads, or hardly anything else.
+            It is a photograph, or there are no roads, or hardly anything else.
         """
+        if self.photograph:
+            raise PhotographError(self.photograph)
         name, is_mask = self._raster.name, self._raster.model_threshold is None
         roads, observed = _separate(self._raster, self._channel, threshold)
         if is_mask:
@@ -151,42 +156,59 @@ def open_mask(
     name: str | None = None,
     voids: bool = True,
 ) -> Iterator[MaskSource]:
-    """Open a road mask or a soft map of roads: other parameters and errors as of `read_mask`."""
-    choice = choice or Choice()
-    with open_bands(source, choice, name) as raster:
-        _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
-        own = raster.model_threshold
-        if own is not None and threshold is None:
-            values = tuple(float(round(PROBABILITY_SURE * item)) for item in spread_probability(own))
-            yield MaskSource(values, raster, 0, False, (0.0, float(PROBABILITY_SURE)))
-            return
-        _require_mask(raster)
-        if choice.road_class is not None:
-            raster = _of_class(raster, choice.road_class)
+    """Open a road mask or a soft map of roads; other parameters and errors as of `read_mask`.
+
+    A photograph is no error before it is read (see `MaskSource.photograph`).
+    """
+    with open_bands(source, choice or Choice(), name) as raster:
+        try:
+            mask = _interpret(raster, choice or Choice(), threshold, voids)
+        except PhotographError as error:
+            mask = MaskSource((0.0,), raster, 0, False, None, photograph=str(error))
+        yield mask
+
+
+def is_photograph(source: str | os.PathLike[str] | AnyArray) -> bool:
+    """Whether the values of a raster are a photograph's; not where it cannot be read."""
+    try:
+        with open_mask(source) as mask:
+            return bool(mask.photograph)
+    except MaskError:
+        return False
+
+
+def _interpret(raster: Raster, choice: Choice, threshold: float | None, voids: bool) -> MaskSource:
+    """Choose the band, and the thresholds above which its values are road."""
+    _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
+    own = raster.model_threshold
+    if own is not None and threshold is None:
+        values = tuple(float(round(PROBABILITY_SURE * item)) for item in spread_probability(own))
+        return MaskSource(values, raster, 0, False, (0.0, float(PROBABILITY_SURE)))
+    _require_mask(raster)
+    if choice.road_class is not None:
+        raster = _of_class(raster, choice.road_class)
+    seen, hidden = _sample(raster)
+    plain = _of_colours(_without_fill(raster, seen))
+    if plain is not raster:
+        raster = plain
         seen, hidden = _sample(raster)
-        plain = _of_colours(_without_fill(raster, seen))
-        if plain is not raster:
-            raster = plain
-            seen, hidden = _sample(raster)
-        if len(hidden):
-            raster = _drawn(raster, seen, hidden)
-            seen, _ = _sample(raster)
-        if len(seen) == 0:
-            raise MaskError(
-                f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads"
-            )
-        channel = int(np.argmax(seen.std(axis=0)))
-        sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
-        refuse_different_bands(sample)
-        if threshold is None:
-            raster, sample = _without_unlabelled(raster, sample)
-        number = find_numbered(sample) if threshold is None else None
-        if number is not None:
-            _LOG.warning("%s: holds a number for each of its roads: all above 0 is road", visible(raster.name))
-        threshold = threshold if number is None else number
-        thresholds = find_thresholds(sample) if threshold is None else (threshold,)
-        levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
-        yield MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, seen, channel, choice))
+    if len(hidden):
+        raster = _drawn(raster, seen, hidden)
+        seen, _ = _sample(raster)
+    if len(seen) == 0:
+        raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
+    channel = int(np.argmax(seen.std(axis=0)))
+    sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
+    refuse_different_bands(sample)
+    if threshold is None:
+        raster, sample = _without_unlabelled(raster, sample)
+    number = find_numbered(sample) if threshold is None else None
+    if number is not None:
+        _LOG.warning("%s: holds a number for each of its roads: all above 0 is road", visible(raster.name))
+    threshold = threshold if number is None else number
+    thresholds = find_thresholds(sample) if threshold is None else (threshold,)
+    levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
+    return MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, seen, channel, choice))
 
 
 def _part_of(raster: Raster, seen: AnyArray, channel: int, choice: Choice) -> str:
