@@ -28,8 +28,8 @@ def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
 def keep_switch(context: click.Context, parameter: click.Parameter, given: bool) -> None:
     """Keep a switch of the command that runs for all that prints, as click calls back; --quiet for the log, too."""
     context.meta[f"roadgeo.{parameter.name}"] = given
-    if parameter.name == "quiet":
-        _LOG.setLevel(logging.ERROR if given else logging.WARNING)
+    if given and parameter.name == "quiet":
+        _LOG.setLevel(logging.ERROR)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from worlds.fenway import write_streets
 
 from roadgeo._text import visible
 from roadgeo.cli import main
+from roadgeo.cli.locate import locate_command
 from roadgeo.cli.printing import echo, paint, plain
 from roadgeo.errors import MaskError
 from roadgeo.running.tasks import name_tasks
@@ -45,6 +46,14 @@ def test_the_log_is_as_quiet_after_a_command_as_before(others: list[str], status
     log = logging.getLogger("roadgeo")
     before = log.level
     assert main(["index", "--roads", str(write_streets(tmp_path / "streets.gpkg")), *others]) == status
+    assert log.level == before
+
+
+def test_a_command_that_is_only_parsed_leaves_the_log_alone() -> None:
+    """Whoever read the options of a command had fewer messages from then on."""
+    log = logging.getLogger("roadgeo")
+    before = log.level
+    locate_command.make_context("locate", ["image.tif"])
     assert log.level == before
 
 
