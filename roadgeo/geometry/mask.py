@@ -14,7 +14,15 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
 
-__all__ = ["PIXEL_TO_PLANE", "PROBABILITY_SURE", "PROBABILITY_UNKNOWN", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
+__all__ = [
+    "PIXEL_TO_PLANE",
+    "PROBABILITY_SURE",
+    "PROBABILITY_UNKNOWN",
+    "RoadMask",
+    "extent",
+    "pixel_to_plane",
+    "plane_to_pixel",
+]
 
 #: 3 x 3 homography that takes pixels (column, row) to the query plane (x, y). It is its own inverse.
 PIXEL_TO_PLANE: FloatArray = np.diag([1.0, -1.0, 1.0])
@@ -32,6 +40,13 @@ def pixel_to_plane(pixels: FloatArray) -> FloatArray:
 def plane_to_pixel(xy: FloatArray) -> FloatArray:
     """Take (..., 2) positions of the query plane to pixels (column, row)."""
     return np.asarray(xy, float) * (1.0, -1.0)
+
+
+def extent(shown: BoolArray) -> tuple[slice, slice]:
+    """Return the rows and columns of (H, W) from the first to the last in which something is shown."""
+    at = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(int(line[0]), int(line[-1]) + 1) for line in at)
+    return rows, columns
 
 
 @dataclass(frozen=True)

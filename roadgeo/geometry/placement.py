@@ -262,11 +262,10 @@ class Placement:
         matrix : (3, 3) float64
             Affine map from its pixels to this image's.
         """
-        corners = Homography(matrix)(Frame(*size).corners)
-        away = np.hypot(*(corners[:, None] - Frame(*self.size).corners[None]).transpose(2, 0, 1))
-        order = away.argmin(axis=1)  # which corner of this image each of the other's is
-        pairs = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
         covariance, matches, rival = self.corner_covariance_m2, self.matches, self.rival
+        corners = Frame(*self.size).corners, Homography(matrix)(Frame(*size).corners)
+        by_elements = [Homography(self.matrix).by_elements(each).reshape(8, -1)[:, :8] for each in corners]
+        by_corners = by_elements[1] @ np.linalg.inv(by_elements[0])  # (8, 8) how the other's corners move with these
         wide, high = np.hypot(*matrix[:2, :2])
         stays = bool(np.linalg.det(matrix[:2, :2]) > 0.0 and abs(wide / high - 1.0) <= _SQUARE)
         back = Homography(PIXEL_TO_PLANE @ np.linalg.inv(matrix) @ PIXEL_TO_PLANE)
@@ -274,7 +273,7 @@ class Placement:
             self,
             size=size,
             matrix=self.matrix @ matrix,
-            corner_covariance_m2=None if covariance is None else covariance[np.ix_(pairs, pairs)],
+            corner_covariance_m2=None if covariance is None else by_corners @ covariance @ by_corners.T,
             focal_px=None if self.focal_px is None else self.focal_px / math.sqrt(wide * high),
             is_pinhole=self.is_pinhole and stays,
             matches=None if matches is None else replace(matches, query_xy=back(matches.query_xy)),

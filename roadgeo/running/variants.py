@@ -16,15 +16,17 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.homography import Homography, shift
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, extent
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference
 from roadgeo.running.passes import Locate
 
-__all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "undoing"]
+__all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "trimmed", "undoing"]
+
+_MIN_SIDE = 32  # pixels, of a part that is located by itself
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,25 @@ def mirrored(variant: Variant) -> Variant:
     return Variant(variant.mask.mirrored(), over @ variant.matrix)
 
 
-def stretched(mask: RoadMask, stretch: float) -> Variant:
-    """Return a mask whose pixels are `stretch` times as wide as high with square pixels, of about as many."""
-    height, width = mask.shape
-    return resampled(mask, (round(height / math.sqrt(stretch)), round(width * math.sqrt(stretch))))
+def trimmed(mask: RoadMask) -> Variant:
+    """Return a mask without the margins that were not observed: a place is judged over its whole frame."""
+    variant = Variant(mask, np.eye(3))
+    if mask.observed is None or not mask.observed.any():
+        return variant
+    part = rows, columns = extent(mask.observed)
+    seen = mask.observed[part].copy()
+    if min(seen.shape) < _MIN_SIDE or seen.size == mask.observed.size:
+        return variant
+    probability = None if mask.probability is None else mask.probability[part].copy()
+    shown = RoadMask(mask.roads[part].copy(), None if seen.all() else seen, mask.name, probability)
+    return Variant(shown, shift(-columns.start, -rows.start))
+
+
+def stretched(variant: Variant, stretch: float) -> Variant:
+    """Return a variant whose pixels are `stretch` times as wide as high with square pixels, of about as many."""
+    height, width = variant.mask.shape
+    square = resampled(variant.mask, (round(height / math.sqrt(stretch)), round(width * math.sqrt(stretch))))
+    return Variant(square.mask, square.matrix @ variant.matrix)
 
 
 def resampled(mask: RoadMask, shape: tuple[int, int]) -> Variant:
@@ -80,7 +97,7 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
 
 
 def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
-    """Return what locates a mask as `how` does, its pixels made square and itself mirrored back before the search.
+    """Return what locates a mask as `how` does: without margins, with square pixels, and mirrored back.
 
     Parameters
     ----------
@@ -89,13 +106,14 @@ def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
     mirror : bool
         The mask is mirrored.
     """
-    if aspect in (None, 1.0) and not mirror:
-        return how
 
     def locate(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
-        variant = Variant(mask, np.eye(3)) if aspect is None else stretched(mask, aspect)
+        variant = trimmed(mask)
+        variant = variant if aspect in (None, 1.0) else stretched(variant, aspect)
         variant = mirrored(variant) if mirror else variant
         answer = how(variant.mask, references, options)
+        if variant.mask is mask:
+            return answer
         found = answer.location if isinstance(answer, Explanation) else answer
         found = _stating_pixels(in_pixels_of(found, mask.shape[::-1], variant.matrix), aspect)
         return replace(answer, location=found) if isinstance(answer, Explanation) else found

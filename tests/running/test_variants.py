@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from worlds.demo import DRONE
 
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import open_reference
-from roadgeo.running.variants import Variant, in_pixels_of, mirrored, resampled
+from roadgeo.running.variants import Variant, in_pixels_of, mirrored, resampled, undoing
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 
@@ -57,6 +59,22 @@ def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
     again = in_pixels_of(turned, located.size, variant.matrix)
     assert not again.mirrored
     assert np.allclose(again.corner_covariance_m2, located.corner_covariance_m2)
+
+
+@pytest.mark.parametrize("margins", [((300, 300), (300, 300)), ((0, 400), (150, 20))])
+def test_margins_that_were_not_observed_cost_nothing(located, porto, margins):
+    """A place is judged over its whole frame, where margins would count as places without roads."""
+    mask = read_mask(DRONE)
+    roads, seen = (np.pad(values, margins) for values in (mask.roads, np.ones(mask.shape, np.bool_)))
+    padded = RoadMask(roads, seen, "padded")
+    found = undoing(locate, None, False)(padded, [open_reference(porto)], LocateOptions())
+    assert found.log10_odds == pytest.approx(located.log10_odds)
+    assert found.size == padded.shape[::-1]
+    (top, _), (left, _) = margins
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * located.size + (left, top)
+    assert np.allclose(Homography(found.homography)(corners), located.footprint, atol=1e-3)
+    here = found.place.in_pixels(located.size, shift(left, top))
+    assert np.allclose(here.corner_covariance_m2, located.corner_covariance_m2, rtol=1e-3, atol=1e-3)
 
 
 def test_masks_on_another_grid():

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._text import visible
 from roadgeo.errors import MaskError
 from roadgeo.storage.rasters import MAX_SIDE, open_raster, page_of, read_palette
 
@@ -21,19 +23,25 @@ if TYPE_CHECKING:
 
 __all__ = ["Photograph", "find_ground", "find_voids", "open_photograph"]
 
+_LOG = logging.getLogger(__name__)
+
 MIN_SIDE = 64
+_SIDES = ("left", "top", "right", "bottom")
 _STRIP_PIXELS = 1 << 21  # read at a time
 _SAMPLE_SIDE = 1024  # deep values are stretched by the range of a sample of this size
 
 #: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.
 _WHITE, _BLACK = 250, 3
-_DARKEST, _LIGHTEST = 8, 245  # of stretched values
-_FEW_VALUES = (
-    64  # 8-bit values that span less, but for half a hundredth at either end, are stretched: night, haze, a flat scan
-)
-_SHOWN_SHARE = 0.1  # of a frame that is not filled, at least
-_FILLED_SHARE = 0.01  # of the frame that has the least or the greatest value, at least, where it is a fill
 _VOID_CORE_PX, _VOID_AREA_PX, _VOID_EDGE_PX = 15, 20_000, 9
+_DARKEST, _LIGHTEST = 8, 245  # of stretched values
+#: 8-bit values that span less, but for half a hundredth at either end, are stretched: night, haze, a flat scan.
+_FEW_VALUES = 64
+_SHOWN_SHARE = 0.1  # of a frame that lies within margins and is not filled, at least
+_FILL_PATCH_PX, _MANY_VALUES = 5, 9
+#: A line of a margin has one value, but for paper's grain (share of the range of values in the middle of the frame)
+#: and for what is written there (share of the line).
+_GRAIN, _PLAIN_SHARE = 0.04, 0.9
+_MARGIN_EDGE_PX = 2  # of the sample, by which a margin is wider than its plain lines
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,14 @@ class Photograph:
 
         return replace(self, width=round(wide * self.width), height=round(high * self.height), read=read)
 
+    def cut(self, left: float, top: float, width: int, height: int) -> Photograph:
+        """Return a part of it."""
+
+        def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:
+            return self.read(left + x, top + y, w, h, shape)
+
+        return replace(self, width=width, height=height, read=read)
+
 
 @contextmanager
 def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | None = None) -> Iterator[Photograph]:
@@ -90,7 +106,7 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
                 f"{name}: {dataset.width} x {dataset.height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side"
             )
         chosen = _choose_bands(dataset, name) if bands is None else _require_bands(dataset, name, bands)
-        stretch = _find_stretch(dataset, chosen, name)
+        tones, box = _find_tones(dataset, chosen, name)
         turn = 255 if dataset.tags(ns="IMAGE_STRUCTURE").get("MINISWHITE") == "YES" else 0  # a negative, by its tag
 
         @lru_cache(maxsize=1)  # where there is ground is found first, and a picture of one tile is that read again
@@ -98,9 +114,26 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
             left: float, top: float, width: float, height: float, shape: tuple[int, int]
         ) -> tuple[AnyArray, BoolArray]:
             values, valid = _read(dataset, chosen, (left, top, width, height), shape)
-            return stretch(values) ^ np.uint8(turn), valid
+            return tones.rgb(values) ^ np.uint8(turn), valid & box.covers((left, top, width, height), shape)
 
         yield Photograph(name, dataset.width, dataset.height, read, page_of(dataset))
+
+
+class _Box(NamedTuple):
+    """A part of a picture, pixels."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def covers(self, part: tuple[float, float, float, float], shape: tuple[int, int]) -> BoolArray:
+        """Return (H, W) where the pixels of a part (left, top, width, height) on a grid of that shape lie inside."""
+        left, top, width, height = part
+        x = left + width * (np.arange(shape[1]) + 0.5) / shape[1]
+        y = top + height * (np.arange(shape[0]) + 0.5) / shape[0]
+        covered: BoolArray = ((y > self.top) & (y < self.bottom))[:, None] & (x > self.left) & (x < self.right)
+        return covered
 
 
 def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
@@ -147,47 +180,120 @@ def _read(
     return np.moveaxis(values, 0, 2), valid
 
 
-def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callable[[AnyArray], AnyArray]:
-    """Return a function from (H, W, B) values to (H, W, 3) 8-bit RGB."""
+@dataclass(frozen=True)
+class _Tones:
+    """How the values of a photograph become RGB of 8 bits.
+
+    Attributes
+    ----------
+    palette : (256, 3) or None
+        Colours that values stand for.
+    span : (low, high) or None
+        Values that become dark and light; None: they are 8 bit, and stay.
+    fills : sequence of ((B,), int)
+        Values of areas that show nothing, though no file declares them, and the black or white that they become.
+    """
+
+    palette: AnyArray | None = None
+    span: tuple[float, float] | None = None
+    fills: Sequence[tuple[AnyArray, int]] = ()
+
+    def rgb(self, values: AnyArray) -> AnyArray:
+        """Return (H, W, B) values as (H, W, 3) RGB."""
+        if self.palette is not None:
+            colours: AnyArray = self.palette[values[..., 0]]
+            return colours
+        shown = values if self.span is None else self._stretched(values, *self.span)
+        for fill, plain in self.fills:
+            shown = np.where(_patches_of(fill, values)[..., None], np.uint8(plain), shown)
+        return shown if shown.shape[2] == 3 else np.repeat(shown, 3, axis=2)
+
+    def _stretched(self, values: AnyArray, low: float, high: float) -> AnyArray:
+        """Return values as neither black nor white, which would mean that there is no photograph."""
+        scaled = (np.nan_to_num(values.astype(np.float32)) - low) / max(high - low, 1e-9)
+        shown: AnyArray = np.clip(_DARKEST + (_LIGHTEST - _DARKEST) * scaled, _DARKEST, _LIGHTEST).astype(np.uint8)
+        return shown
+
+
+def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_Tones, _Box]:
+    """Return how values become RGB, and what of the frame lies within its margins: both by what a sample shows."""
+    height, width = dataset.shape
     palette = read_palette(dataset) if dataset.count == 1 and dataset.dtypes[0] == "uint8" else None
-    if palette is not None:
-        table = palette
-        return lambda values: table[values[..., 0]]
-    kind = dataset.dtypes[bands[0] - 1]
-    scale = max(dataset.shape) / _SAMPLE_SIDE
-    shape = max(1, round(dataset.height / max(scale, 1))), max(1, round(dataset.width / max(scale, 1)))
-    whole = (0, 0, dataset.width, dataset.height)
+    scale = max(max(dataset.shape) / _SAMPLE_SIDE, 1.0)
+    shape = max(1, round(height / scale)), max(1, round(width / scale))
+    whole = (0.0, 0.0, float(width), float(height))
     (sample, valid), (exact, _) = (_read(dataset, bands, whole, shape, nearest) for nearest in (False, True))
     if not valid.any():
         raise MaskError(f"{name}: holds no observed pixel; give a photograph that shows ground")
-    fills = _find_fills(exact[valid])
-    shown = valid & ~np.isin(exact, fills).all(axis=2)
-    if shown.sum() < _SHOWN_SHARE * valid.sum():
-        fills, shown = [], valid
+    if palette is not None:
+        exact = palette[exact[..., 0]]
+    rows, columns = _within_margins(np.where(valid[..., None], exact, exact[valid][0]))
+    box = _Box(columns.start * scale, rows.start * scale, columns.stop * scale, rows.stop * scale)
+    _report_margins(name, box, (width, height))
+    exact, sample, valid = (values[rows, columns] for values in (exact, sample, valid))
+    if palette is not None:
+        return _Tones(palette), box
+    fills = _find_fills(name, exact, valid)
+    shown = valid & ~np.any([(exact == fill).all(axis=2) for fill in fills], axis=0) if fills else valid
     seen = sample[shown].astype(np.float64)
     low, high = np.percentile(seen, [1, 99])
-    if kind == "uint8" and not 0 < np.ptp(np.percentile(seen, [0.5, 99.5])) < _FEW_VALUES:
-        return _as_rgb
-
-    def stretch(values: AnyArray) -> AnyArray:
-        scaled = (np.nan_to_num(values.astype(np.float32)) - low) / max(high - low, 1e-9)
-        # Neither black nor white, which would mean that there is no photograph.
-        found = np.clip(_DARKEST + (_LIGHTEST - _DARKEST) * scaled, _DARKEST, _LIGHTEST).astype(np.uint8)
-        for fill in fills:
-            found[(values == fill).all(axis=2)] = 255 if fill > high else 0
-        return _as_rgb(found)
-
-    return stretch
+    is_8_bit = dataset.dtypes[bands[0] - 1] == "uint8"
+    keeps = is_8_bit and not 0 < np.ptp(np.percentile(seen, [0.5, 99.5])) < _FEW_VALUES
+    plain = [(fill, 255 if fill.min() > (_WHITE if keeps else high) else 0) for fill in fills]
+    return _Tones(None, None if keeps else (low, high), plain), box
 
 
-def _find_fills(seen: AnyArray) -> list[float]:
-    """Return the least and the greatest of (n, B) values where many pixels have it in all bands: a fill, maybe."""
-    ends = (float(seen.min()), float(seen.max()))
-    return [end for end in ends if (seen == end).all(axis=1).mean() > _FILLED_SHARE]
+def _within_margins(values: AnyArray) -> tuple[slice, slice]:
+    """Return the rows and columns of (H, W, B) values without the plain lines around them; all where little is left."""
+    height, width = values.shape[:2]
+    middle = values[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    grain = _GRAIN * np.ptp(np.percentile(middle, [1, 99]))
+    box = everything = slice(0, height), slice(0, width)
+    while (inner := _less_margin(values, box, grain)) != box:
+        box = inner
+    return box if values[box].size >= _SHOWN_SHARE * values.size else everything
 
 
-def _as_rgb(values: AnyArray) -> AnyArray:
-    return values if values.shape[2] == 3 else np.repeat(values, 3, axis=2)
+def _less_margin(values: AnyArray, box: tuple[slice, slice], grain: float) -> tuple[slice, slice]:
+    """Return a part of (H, W, B) values without the lines at its edges that are of one value each."""
+    part = values[box].astype(np.float32)
+    inner = []
+    for axis, side in enumerate(box):
+        lines = part if axis == 0 else part.swapaxes(0, 1)
+        off = np.abs(lines - np.median(lines, axis=1, keepdims=True)).max(axis=2)
+        uneven = np.flatnonzero((off <= grain).mean(axis=1) < _PLAIN_SHARE)
+        first, last = (uneven[0], uneven[-1]) if len(uneven) else (0, len(lines) - 1)
+        before, after = (n + _MARGIN_EDGE_PX if n else 0 for n in (int(first), len(lines) - 1 - int(last)))
+        inner.append(slice(side.start + before, max(side.stop - after, side.start + before + 1)))
+    return inner[0], inner[1]
+
+
+def _report_margins(name: str, box: _Box, size: tuple[int, int]) -> None:
+    margins = box.left, box.top, size[0] - box.right, size[1] - box.bottom
+    if max(margins) > 0.5:
+        listed = ", ".join(f"{px:.0f} px {side}" for px, side in zip(margins, _SIDES, strict=True) if px > 0.5)
+        _LOG.warning("%s: plain margins are not observed: %s", visible(name), listed)
+
+
+def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> list[AnyArray]:
+    """Return the (B,) colours that (H, W, B) values have in large patches: the least, the greatest, a corner's."""
+    seen, fills = values[valid], []
+    corners = values[[0, 0, -1, -1], [0, -1, 0, -1]]
+    for fill in np.unique([np.full_like(seen[0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
+        is_fill = find_voids((values == fill).all(axis=2) & valid)
+        others = valid & ~is_fill
+        is_picture = others.sum() >= _SHOWN_SHARE * valid.sum() and len(np.unique(values[others])) >= _MANY_VALUES
+        if is_fill.any() and is_picture:
+            fills.append(fill)
+            shown = ", ".join(f"{value:g}" for value in np.unique(fill))
+            _LOG.warning("%s: areas of the value %s are taken for not observed", visible(name), shown)
+    return fills
+
+
+def _patches_of(fill: AnyArray, values: AnyArray) -> BoolArray:
+    """Return where (H, W, B) values are those of a fill, and so are all of a small square."""
+    is_fill, patch = (values == fill).all(axis=2).view(np.uint8), np.ones((_FILL_PATCH_PX, _FILL_PATCH_PX), np.uint8)
+    return np.asarray(cv2.morphologyEx(is_fill, cv2.MORPH_OPEN, patch) > 0)
 
 
 def find_ground(photograph: Photograph, shape: tuple[int, int]) -> BoolArray:
@@ -205,19 +311,20 @@ def find_ground(photograph: Photograph, shape: tuple[int, int]) -> BoolArray:
     return ground
 
 
-def find_voids(white: BoolArray, black: BoolArray) -> BoolArray:
-    """Return (H, W) where there is no photograph, given where it is as good as white and as good as black.
+def find_voids(*plain: BoolArray) -> BoolArray:
+    """Return (H, W) where there is no photograph, given where it is as good as white, as good as black, a fill.
 
     Only large plain areas count; a little of their edge, which is smeared, goes with them.
     """
-    void = np.zeros(white.shape, np.uint8)
-    for plain in (white, black):
-        if np.count_nonzero(plain) < min(_VOID_AREA_PX, plain.size // 10):
+    void = np.zeros(plain[0].shape, np.uint8)
+    least = min(_VOID_AREA_PX, void.size // 10)
+    for one in plain:
+        if np.count_nonzero(one) < least:
             continue
         core = np.ones((_VOID_CORE_PX, _VOID_CORE_PX), np.uint8)
-        opened = cv2.morphologyEx(plain.view(np.uint8), cv2.MORPH_OPEN, core)
+        opened = cv2.morphologyEx(one.view(np.uint8), cv2.MORPH_OPEN, core)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, ltype=cv2.CV_32S)
-        large = stats[:, cv2.CC_STAT_AREA] >= min(_VOID_AREA_PX, plain.size // 10)
+        large = stats[:, cv2.CC_STAT_AREA] >= least
         large[0] = False
         void |= large[labels].view(np.uint8)
     if not void.any():

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import PROBABILITY_SURE
 from roadgeo.roads.vectorization import vectorize
@@ -81,7 +80,7 @@ def rank_scales(
             found[scale], worth[scale] = None, -scale
             continue
         part, same_ground = _most_roads(part, before, [round(_TRIED_TILES * side / scale) for side in network.seen])
-        before, shown = None, _cut(photograph, part)
+        before, shown = None, photograph.cut(*part)
         with suppress(MaskError):  # no ground
             before = segment(shown, network, scale)
         intersections = score(before)
@@ -144,10 +143,3 @@ def _most_roads(part: _Part, seen: ProbabilityMap | None, size: Sequence[int]) -
     top = part.top + min(round(float(y) / y_scale), part.height - height)
     values = np.ascontiguousarray(seen.values[y : y + h, x : x + w])
     return _Part(left, top, width, height), replace(seen, values=values)
-
-
-def _cut(photograph: Photograph, part: _Part) -> Photograph:
-    def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:
-        return photograph.read(part.left + x, part.top + y, w, h, shape)
-
-    return Photograph(photograph.name, part.width, part.height, read)

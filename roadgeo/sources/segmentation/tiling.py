@@ -13,6 +13,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError
+from roadgeo.geometry.mask import PROBABILITY_SURE, extent
 from roadgeo.sources.segmentation.card import TILE_STEP
 from roadgeo.sources.segmentation.network import Network
 from roadgeo.sources.segmentation.photograph import Photograph, find_ground, is_plain
@@ -74,28 +75,48 @@ def segment(
             f"{photograph.name}: {shape[1]} x {shape[0]} pixels at the model's scale; expected at most "
             f"{MAX_MAP_PIXELS:,} in all: give the size of a pixel (--gsd), or cut the photograph up"
         )
-    values = np.empty((shape[0] // step, shape[1] // step), np.uint8)
+    values = np.full((shape[0] // step, shape[1] // step), NODATA, np.uint8)
     ground = find_ground(photograph, values.shape)
     if not ground.any():
         raise MaskError(f"{photograph.name}: shows no ground, only nodata, white or black; give a photograph")
-
-    def read(top: int, rows: int) -> AnyArray:
-        y_scale = photograph.height / shape[0]
-        return photograph.read(0.0, top * y_scale, float(photograph.width), rows * y_scale, (rows, shape[1]))[0]
-
-    seen = _seen(network, shape)
-    what = f"finding roads in {photograph.name}"
-    say(what, 0.0)
-    done, rest = 0, np.empty((0, shape[1]), np.float32)
-    for rows in _blend(read, shape, seen, partial(_look, network, ways)):
-        rows = np.concatenate([rest, rows])
-        n = len(rows) // step
-        values[done : done + n] = np.rint(254 * _reduce(rows[: n * step], step))
-        done, rest = done + n, rows[n * step :]
-        say(what, done * step / shape[0])
+    _segment_part(photograph, network, extent(ground), values, say, step=step, ways=ways)
     values[~ground] = NODATA
     pixel = photograph.width / values.shape[1]
     return ProbabilityMap(values, network.card.threshold, photograph.name, network.name, pixel)
+
+
+def _segment_part(
+    photograph: Photograph,
+    network: Network,
+    part: tuple[slice, slice],
+    values: AnyArray,
+    say: Say,
+    *,
+    step: int,
+    ways: int,
+) -> None:
+    """Fill in the rows and columns of a map, (H, W) of the photograph: what lies around them is not shown to a model.
+
+    A model is trained on ground, and finds fewer roads beside a margin.
+    """
+    inside = values[part]
+    shape = step * inside.shape[0], step * inside.shape[1]
+    y_scale, n_columns = photograph.height / (step * values.shape[0]), step * values.shape[1]
+    first, left = (step * side.start for side in part)
+
+    def read(top: int, n_rows: int) -> AnyArray:
+        x, width = (photograph.width * n / n_columns for n in (left, shape[1]))
+        return photograph.read(x, (first + top) * y_scale, width, n_rows * y_scale, (n_rows, shape[1]))[0]
+
+    what = f"finding roads in {photograph.name}"
+    say(what, 0.0)
+    done, rest = 0, np.empty((0, shape[1]), np.float32)
+    for rows in _blend(read, shape, _seen(network, shape), partial(_look, network, ways)):
+        rows = np.concatenate([rest, rows])
+        n = len(rows) // step
+        inside[done : done + n] = np.rint(PROBABILITY_SURE * _reduce(rows[: n * step], step))
+        done, rest = done + n, rows[n * step :]
+        say(what, done * step / shape[0])
 
 
 def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:
