@@ -3,7 +3,6 @@ import socket
 import time
 
 import numpy as np
-import osmnx
 import pytest
 import shapely
 from worlds.fake_osm import EMPTY, OUTLINE, fake_osm
@@ -128,7 +127,7 @@ def test_an_area_astride_180_degrees_is_asked_for_in_two(osm, pauses):
 
 
 def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch):
-    monkeypatch.setattr(osmnx.settings, "max_query_area_size", 500_000)
+    monkeypatch.setattr("osmnx.settings.max_query_area_size", 500_000)
     osm.overpass += [(200, {}, osm.roads), "cut"]
     with pytest.raises(RoadSourceError, match="broke off"):
         fetch_roads("Fenway, Boston", options=ask(osm))
@@ -144,6 +143,8 @@ def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch
 
 
 def test_nothing_of_osmnx_is_changed_for_the_rest_of_a_program(osm, pauses):
+    import osmnx
+
     before, resolve = dict(vars(osmnx.settings)), socket.getaddrinfo
     fetch_roads("Fenway, Boston", options=ask(osm))
     assert dict(vars(osmnx.settings)) == before

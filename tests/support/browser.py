@@ -6,10 +6,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import playwright.sync_api
 import pytest
+
+if TYPE_CHECKING:
+    import playwright.sync_api
 
 __all__ = ["FLAGS", "Browser", "Page", "browser", "find_chromium"]
 
@@ -32,7 +34,7 @@ def find_chromium() -> str:
 class Page:
     """A page in the browser, and what it said and asked for since it was opened."""
 
-    def __init__(self, page: playwright.sync_api.Page) -> None:
+    def __init__(self, page: "playwright.sync_api.Page") -> None:
         self._page = page
         self._protocol = page.context.new_cdp_session(page)
         self._said: list[str] = []
@@ -106,7 +108,7 @@ class Page:
 class Browser:
     """A running Chromium."""
 
-    def __init__(self, running: playwright.sync_api.Browser) -> None:
+    def __init__(self, running: "playwright.sync_api.Browser") -> None:
         self._running = running
 
     @contextmanager
@@ -133,9 +135,11 @@ class Browser:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """One Chromium for the tests of a module."""
+    from playwright.sync_api import sync_playwright
+
     executable = find_chromium()
     with (
-        playwright.sync_api.sync_playwright() as started,
+        sync_playwright() as started,
         started.chromium.launch(executable_path=executable, args=FLAGS) as running,
     ):
         yield Browser(running)
