@@ -1,7 +1,10 @@
 """Fixtures shared by all tests."""
 
+import json
 import os
 import signal
+from collections import Counter
+from collections.abc import Generator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,27 +22,113 @@ settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
 
-#: Folders whose tests start programs, draw masks or run whole commands: they take most of the time.
-SLOW = ("accept", "cli", "docs", "evaluation", "examples", "flights", "outputs", "qgis", "running", "serving")
-SLOW += ("workflows",)
+#: Seconds of processors of each slow test, of its programs, too; `--measure` renews it.
+SECONDS = Path(__file__).with_name("seconds.json")
+SLOW_S = 2.0
+
+#: Left to the night, with all that needs one of the fixtures below: how the names of these tests begin.
+NIGHTLY = (
+    "tests/cli/test_fence.py",
+    "tests/cli/test_traces.py",
+    "tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/",
+    "tests/examples/",
+    "tests/outputs/test_page_widths.py",
+    "tests/qgis/",
+    "tests/running/test_cluster.py",
+    "tests/running/test_divided.py",
+    "tests/test_endurance.py",
+)
+DAILY = ("tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/tutorial.md]",)
+#: A browser, QGIS and the development data.
+NIGHTLY_FIXTURES = {"browser", "chromium", "data_dir", "qgis"}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--measure", action="store_true", help=f"write what slow tests take to {SECONDS.name}")
+
+
+def names_files(config: pytest.Config) -> bool:
+    return any(".py" in name for name in config.args)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """Files that are named are run by this process alone."""
+    return 0 if names_files(config) else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if names_files(config) and config.option.markexpr == "not nightly":
+        config.option.markexpr = ""  # and whole
+    if config.getoption("measure") and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Measure())
+
+
+def pytest_report_header() -> str:
+    return f"nightly (-m ''): {', '.join((*NIGHTLY, *sorted(NIGHTLY_FIXTURES)))}"
+
+
+def is_nightly(item: pytest.Item) -> bool:
+    needs = NIGHTLY_FIXTURES.intersection(getattr(item, "fixturenames", ()))
+    return bool(needs) or (item.nodeid.startswith(NIGHTLY) and item.nodeid not in DAILY)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what is slow by its folder, and what reads real data, so that no new test there is forgotten.
+    """Mark what is slow, as measured, and what is nightly.
 
-    Where several processes share the tests, slow ones come first: none is to wait for another's long file in the end.
+    Where several processes share the tests, files that take longest come first: none is left to one process in the end.
     """
-    here = Path(__file__).parent
+    seconds = json.loads(SECONDS.read_text("utf-8"))
     for item in items:
-        if item.path.relative_to(here).parts[0] in SLOW or item.get_closest_marker("realdata"):
+        if item.nodeid in seconds:
             item.add_marker(pytest.mark.slow)
+        if is_nightly(item):
+            item.add_marker(pytest.mark.nightly)
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+        files = Counter()
+        for name, took in seconds.items():
+            files[name.partition("::")[0]] += took
+        items.sort(key=lambda item: -files[item.nodeid.partition("::")[0]])
+
+
+def of_processors() -> float:
+    """Seconds that this process and those that it started and outlived have taken so far."""
+    return sum(os.times()[:4])
+
+
+def pytest_runtest_logstart() -> None:
+    """Start the clock of a test."""
+    _started.append(of_processors())
+
+
+_started: list[float] = []
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, object, object]:
+    """Add the seconds of a test to the last of its reports."""
+    if call.when == "teardown":
+        item.user_properties.append(("seconds", of_processors() - _started.pop()))
+    return (yield)
+
+
+class Measure:
+    """Keeps what the tests that ran took."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, float] = json.loads(SECONDS.read_text("utf-8"))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "teardown":
+            self.kept[report.nodeid] = round(dict(report.user_properties)["seconds"], 1)
+
+    def pytest_sessionfinish(self) -> None:
+        slow = {name: took for name, took in sorted(self.kept.items()) if took > SLOW_S}
+        SECONDS.write_text(json.dumps(slow, indent=0, ensure_ascii=False) + "\n", "utf-8")
 
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The development data, for tests marked `realdata`; they skip where it is absent."""
+    """The development data; tests that need them skip where they are absent."""
     folder = os.environ.get("ROADGEO_DATA")
     if not folder or not Path(folder).is_dir():
         pytest.skip("ROADGEO_DATA is not set: no development data here")

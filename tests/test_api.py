@@ -23,8 +23,6 @@ from roadgeo.sources.roads import read_roads
 
 QUICK = LocateOptions(effort="quick")
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def porto() -> roadgeo.Reference:

@@ -21,7 +21,6 @@ from roadgeo.workflows import locate
 _SCRIPT = Path(__file__).parent / "support" / "endurance.py"
 
 
-@pytest.mark.slow
 def test_neither_memory_nor_files_nor_time_grow() -> None:
     # In a process of its own: in this one other tests' files may be closed, and their connections open, meanwhile.
     run = subprocess.run([sys.executable, str(_SCRIPT), "--count", "150"], capture_output=True, text=True, check=True)

@@ -90,7 +90,6 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.slow
 def test_an_onboard_computer_locates_and_names_what_is_missing(porto: Path, tmp_path: Path) -> None:
     """A reference that was built elsewhere is all it needs."""
 

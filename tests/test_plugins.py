@@ -198,7 +198,6 @@ def test_the_example_is_twenty_five_lines() -> None:
     assert sum(bool(line.strip()) for line in lines) <= 25
 
 
-@pytest.mark.slow
 def test_the_example_is_installed_and_used(installed: dict[str, str], tmp_path: Path) -> None:
     def roadgeo(*arguments: str) -> str:
         command = [sys.executable, "-m", "roadgeo", *arguments]

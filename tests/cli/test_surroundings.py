@@ -71,7 +71,6 @@ def test_no_font_is_needed_but_those_that_come_along(
         assert (tmp_path / name).stat().st_size > 1000
 
 
-@pytest.mark.slow
 def test_further_processes_import_nothing_from_the_current_folder(porto: Path, tmp_path: Path) -> None:
     here, program = tmp_path / "here", tmp_path / "bin" / "roadgeo"
     for folder in (here, program.parent):

@@ -25,7 +25,6 @@ def run(name: str, *arguments: object, cwd: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=True).stdout
 
 
-@pytest.mark.slow
 def test_a_mask_has_one_place_on_maps_that_were_made_of_one(tmp_path: Path) -> None:
     item = tmp_path / "map_00.shards"
     for command in (

@@ -10,8 +10,6 @@ from support.mavlink_peer import free_port, listening, of_kind
 from roadgeo.errors import OutputError
 from roadgeo.flights.mavlink import MavlinkSender, PositionFix, fix_of, has_pymavlink
 
-pytestmark = pytest.mark.slow
-
 needs = pytest.mark.skipif(not has_pymavlink(), reason="needs pymavlink")
 
 

@@ -42,7 +42,6 @@ def shuffled(masks):
     return [FlightFrame(n, str(k), float(n), masks[k]) for n, k in enumerate(ORDER)]
 
 
-@pytest.mark.slow
 def test_masks_in_no_order_are_placed_in_that_of_the_strip(strip):
     flight, masks, reference = strip
     tracked = place_strips([(item, None) for item in shuffled(masks)], [reference])
@@ -52,7 +51,6 @@ def test_masks_in_no_order_are_placed_in_that_of_the_strip(strip):
     assert max(errors(tracked, flight)) < 4.0
 
 
-@pytest.mark.slow
 def test_a_frame_that_was_scanned_upside_down_and_one_from_elsewhere(strip):
     flight, masks, reference = strip
     other = np.zeros((500, 500), bool)
@@ -66,7 +64,6 @@ def test_a_frame_that_was_scanned_upside_down_and_one_from_elsewhere(strip):
     assert max(errors(placed, flight)) < 4.0
 
 
-@pytest.mark.slow
 def test_pictures_link_frames_that_their_roads_do_not(strip):
     flight, masks, reference = strip
     rng = np.random.default_rng(0)

@@ -17,8 +17,6 @@ from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, follow, lates
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def flight(flown):

@@ -44,7 +44,6 @@ def around_pole(radius, south, start):
     return np.stack(Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(*xy.T), axis=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("south", [False, True])
 @given(start=st.floats(-7, 7))
 def test_a_ring_around_a_pole_is_closed_over_it(south, start):

@@ -194,7 +194,6 @@ def test_add_point_like_the_twin(n):
     assert np.allclose(right, side, atol=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("k1", LENSES)
 @pytest.mark.parametrize(("known", "free"), [(True, 8), (False, 9)])
 def test_roads_like_the_twin(k1, known, free):
@@ -237,7 +236,6 @@ def test_beyond_the_horizon_nothing_is_carried():
     assert carry(P, -10.0, 10.0, 1.0, 0.0)[2] < 0.02
 
 
-@pytest.mark.slow
 def test_add_row_sums_normal_equations():
     rng = np.random.default_rng(0)
     A, W, b = rng.normal(0, 1, (20, 8)), rng.uniform(0, 1, 20), rng.normal(0, 1, 20)
@@ -259,7 +257,6 @@ def test_exact_observations_give_the_homography(seed):
     assert corner_gap(p, P) < 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"max_radius": 12.0}, {"least_share": 0.8}, {"prior": 10.0}])
 @pytest.mark.parametrize("seed", range(2))
 def test_like_the_twin(seed, changes):
@@ -275,7 +272,6 @@ def test_like_the_twin(seed, changes):
     assert np.allclose(np.tril(normal), np.tril(system), rtol=1e-2, atol=1e-3)
 
 
-@pytest.mark.slow
 def test_like_the_twin_where_points_are_held():
     town, start = Town(0, noise=1.5, pairs=3), jittered(P, 0.004, 0)
     p, n, rms, normal = run(town, start, held_at=start)
@@ -286,7 +282,6 @@ def test_like_the_twin_where_points_are_held():
     assert np.allclose(np.tril(normal), np.tril(expected[3]), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_like_the_twin_with_a_lens():
     town, start = Town(2, noise=1.5, points=50, k1=-0.1), np.append(jittered(P, 0.004, 2)[:8], -0.05)
     p, n, rms, normal = run(town, start, 9, n_iterations=5)

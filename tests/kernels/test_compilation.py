@@ -53,7 +53,6 @@ def compute(site: Path, home: Path) -> list[str]:
     return lines
 
 
-@pytest.mark.slow
 def test_nothing_is_left_in_the_package(installed: Path, tmp_path: Path) -> None:
     before = sorted(installed.rglob("*"))
     home = tmp_path / "home"

@@ -48,7 +48,6 @@ def test_the_jacobian_turns_branches(turn):
     assert not agree(packed(0, 100, 200), packed(60 + turn, 150 + turn, 260 + turn), (c, -s, s, c))
 
 
-@pytest.mark.slow
 def test_like_the_twin():
     rng = np.random.default_rng(1)
     decided = 0

@@ -127,7 +127,6 @@ def test_side_by_side_they_grow_as_alone(roads):
         assert (alone[0] == together[k]).all()
 
 
-@pytest.mark.slow
 def test_grows_like_the_twin(roads):
     network, buckets = roads
     points, along = (array[::8] for array in seen(network, truth(), false=0.3))
@@ -179,7 +178,6 @@ def test_a_step_like_the_twin(roads, holds):
     assert np.allclose(p, expected, atol=1e-5)
 
 
-@pytest.mark.slow
 def test_share_like_the_twin(roads):
     network, buckets = roads
     points, along = (array[::10] for array in seen(network, truth(), false=0.3))

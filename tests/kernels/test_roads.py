@@ -284,7 +284,6 @@ class TestScreen:
         expected = naive.screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, roads[0])
         return shares, expected
 
-    @pytest.mark.slow
     @pytest.mark.parametrize("least", [0.0, 0.2, 0.4])
     def test_like_the_twin(self, least):
         rng = np.random.default_rng(9)

@@ -44,7 +44,6 @@ def random_states(draw: st.DrawFn) -> np.ndarray:
     return np.pad(states, 1, constant_values=SOLID)
 
 
-@pytest.mark.slow
 @settings(deadline=None, max_examples=200)
 @given(random_states(), st.sampled_from([0.0, 1.0, 1.5, 3.0]))
 def test_thin_equals_its_slow_twin(states: np.ndarray, min_end_depth: float) -> None:

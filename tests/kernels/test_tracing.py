@@ -4,7 +4,6 @@ from collections import Counter
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernels.test_thinning import depth, framed, random_states
@@ -21,7 +20,6 @@ def traced(states: np.ndarray) -> Traced:
     return trace(states, pixels, np.empty(states.size, np.int32))
 
 
-@pytest.mark.slow
 @settings(deadline=None, max_examples=200)
 @given(random_states())
 def test_trace_equals_its_slow_twin(states: np.ndarray) -> None:
@@ -65,7 +63,6 @@ def test_nothing_to_trace() -> None:
     assert offsets.tolist() == [0]
 
 
-@pytest.mark.slow
 @settings(deadline=None, max_examples=100)
 @given(random_states(), st.integers(0, 4), st.integers(1, 4), st.integers(0, 9))
 def test_smooth_chains_equals_its_slow_twin(states: np.ndarray, passes: int, spacing: int, trim: int) -> None:

@@ -198,7 +198,6 @@ class TestSides:
 
 
 class TestVertexProbes:
-    @pytest.mark.slow
     @pytest.mark.parametrize("tolerance", [0, 2, 5])
     def test_probe_exactly_what_is_alike(self, tolerance):
         rng = np.random.default_rng(3)
@@ -224,7 +223,6 @@ class TestVertexProbes:
 
 
 class TestNextAlike:
-    @pytest.mark.slow
     @given(
         st.lists(st.one_of(st.integers(0, 728), st.integers(0, 20)), max_size=80),
         st.tuples(*[st.sets(st.integers(0, 8))] * 3),
@@ -291,7 +289,6 @@ class TestLookUp:
         )  # fmt: skip
         return hits.ids[:n], hits.affine[:n], compared
 
-    @pytest.mark.slow
     @pytest.mark.parametrize("tolerance", [1, 5])
     def test_like_the_twin(self, world, tolerance):
         query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)

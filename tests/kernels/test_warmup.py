@@ -43,7 +43,6 @@ def test_all_other_kernels_are_kept_too() -> None:
     assert not compilation._left_to_numba & set(modules)
 
 
-@pytest.mark.slow
 def test_a_warm_process_does_not_import_numba() -> None:
     warm_up()
     subprocess.run([sys.executable, "-c", LOCATE], check=True, timeout=300)
@@ -62,7 +61,6 @@ print(seen, shown[-1:])
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "compiled_here"),
     [(sys.executable, []), ("qgis", ["buckets", "road_rings"]), ("qgis-bin.exe", ["buckets", "road_rings"])],

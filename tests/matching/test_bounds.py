@@ -22,8 +22,6 @@ from roadgeo.roads.network import build_network
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import LocateOptions, locate
 
-pytestmark = pytest.mark.slow  # it searches until the limits
-
 
 def grid_mask(side, step, width, jitter=0.0):
     rng = np.random.default_rng(1)

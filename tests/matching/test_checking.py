@@ -46,7 +46,6 @@ def test_points_that_have_a_twin_beside_them_are_left_out_with_all_that_is_known
         assert check_place(truth, scene, town[1]).verdict in ("agrees", "unknown")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "shift", [Shift(6, 0, 0, 1, 0), Shift(-3, -4, 1, 1, 0), Shift(80, -60, -5, 1, 0), Shift(-200, 220, 3, 1, 0)]
 )

@@ -84,7 +84,6 @@ def test_little_to_see(town, scene, n):
     assert (by_roads.score > 6) == (n > 0)  # one intersection and all the roads are enough
 
 
-@pytest.mark.slow
 def test_road_points_far_from_the_anchor(town, scene):
     sparse = replace(scene, points=scene.points[:0], directions=scene.directions[:0], weights=scene.weights[:0])
     locate(sparse, town[1], limits=SearchOptions(time_limit_s=0.5))

@@ -186,7 +186,6 @@ class TestNearby:
 class TestArithmetic:
     """Against a slow twin that sums over pieces of road, as the formula says."""
 
-    @pytest.mark.slow
     def test_like_the_twin(self, town):
         small = (260, 200)
         truth = camera((2000, 1900), small, 1.3, 10.0, 50.0, 130.0)

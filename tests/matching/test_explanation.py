@@ -124,7 +124,6 @@ def test_watching_changes_nothing(town, mask):
     )  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "fault", "value"),
     [
@@ -151,7 +150,6 @@ def test_a_place_off_the_map_is_told(town, mask):
     assert search["missing"] == [explanation.location.reason]
 
 
-@pytest.mark.slow
 def test_a_mask_of_elsewhere(town):
     search = check(explain(mask_of(random_network(77)), town))
     assert search["starved_at"] in {"odds", "survived", "on_roads", "camera"}
@@ -159,7 +157,6 @@ def test_a_mask_of_elsewhere(town):
     assert all(place["why"] != "located" for place in search["places"])
 
 
-@pytest.mark.slow
 def test_places_of_a_refusal_come_in_the_order_of_its_list(porto):
     """Users take a place by its number: the picture must show the one that they take."""
     elsewhere = next(mask.path for mask in demo_masks() if mask.path.stem == "elsewhere")
@@ -171,7 +168,6 @@ def test_places_of_a_refusal_come_in_the_order_of_its_list(porto):
     np.testing.assert_allclose(shown[: len(listed)], listed[: len(shown)], atol=1e-6)
 
 
-@pytest.mark.slow
 def test_blocks_like_one_another(lattice):
     mask = mask_of(lattice.network)
     explanation = explain(mask, lattice)
@@ -200,7 +196,6 @@ def test_too_few_intersections(town):
     assert draw_explanation(subject(explanation, RoadMask(canvas > 0), town)).shape[1] == 2000
 
 
-@pytest.mark.slow
 def test_the_papers_method_tells_what_it_counts(town, mask):
     unhurried = SearchOptions(time_limit_s=120.0)  # its kernels may be compiled meanwhile
     explanation = explain(mask, town, LocateOptions(method="pair", search=unhurried))
@@ -218,7 +213,6 @@ def test_each_reference_has_its_story(town, mask, lattice):
 
 
 class TestPicture:
-    @pytest.mark.slow
     def test_what_agrees_and_what_does_not(self, town, mask):
         picture = draw_explanation(subject(explain(mask, town), mask, town))
         assert picture.dtype == np.uint8
@@ -226,7 +220,6 @@ class TestPicture:
         assert (picture == rgb("agree")).all(axis=2).sum() > 500
         assert not (picture == STARVED).all(axis=2).any()
 
-    @pytest.mark.slow
     def test_the_stage_that_starved_is_marked(self, town, mask, tmp_path: Path):
         explanation = explain(mask, town, with_camera(gsd_m=(0.3, 0.7)))
         write_explanation_picture(tmp_path / "a.png", subject(explanation, mask, town))
@@ -242,7 +235,6 @@ class TestPicture:
         assert draw_explanation(subject(explain(mask, town), mask, town)).shape[1] == 2000
 
 
-@pytest.mark.slow
 def test_from_the_command_line(town, mask, tmp_path: Path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
@@ -282,7 +274,6 @@ def test_the_true_place_of_a_located_mask_is_not_lost(town, mask):
     assert row["log10_odds"] > 8
 
 
-@pytest.mark.slow
 def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, mask):
     other = mask_of(random_network(9))
     row, explanation = truth_told(other, town, LocateOptions(effort="quick"), lonlat_of(town, TRUTH, 90_000.0))
@@ -292,7 +283,6 @@ def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, 
     assert truth_told(mask, town, LocateOptions(), far)[0]["lost_at"] in {"proposals", "on_roads", "survived"}
 
 
-@pytest.mark.slow
 def test_a_camera_that_refuses_the_true_place_is_named(town, mask):
     row, _ = truth_told(mask, town, with_camera(gsd_m=(1.4, 5.0)), lonlat_of(town, TRUTH))
     assert row["lost_at"] == "camera"

@@ -80,7 +80,6 @@ class TestBuildIndex:
         assert (index.neighbours >= 0).all()
         assert np.allclose(distance, naive.nearest_neighbours(index.xy, index.neighbours.shape[1]))
 
-    @pytest.mark.slow
     def test_segments_are_the_roads(self, town):
         network, index = town
         roads = shapely.multilinestrings([shapely.LineString(line) for line in network.graph.polylines()])

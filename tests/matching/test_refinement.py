@@ -54,7 +54,6 @@ def calibration(town, seeds, **view):
     return np.array(errors), np.array(sigmas)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "view",
     [

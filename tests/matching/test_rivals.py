@@ -68,7 +68,6 @@ def apart(world, matrix, other=None):
     return float(np.hypot(*(Homography(matrix)(evidence.scene.center) - middle)))
 
 
-@pytest.mark.slow
 def test_the_place_leads_all_others_by_the_streets_that_are_missing_there(broken):
     item, estimator = search_of(broken, broken[0])
     place = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED).compare(item)
@@ -79,7 +78,6 @@ def test_the_place_leads_all_others_by_the_streets_that_are_missing_there(broken
     assert place.score < max(met.score for met in estimator.verified)
 
 
-@pytest.mark.slow
 def test_a_rival_that_explains_more_takes_over(broken):
     """The search met a block beside only: that leads nothing, and what leads it is the place."""
     truth, _, evidence = broken
@@ -89,13 +87,11 @@ def test_a_rival_that_explains_more_takes_over(broken):
     assert place.score == pytest.approx(direct.score, abs=0.5)
 
 
-@pytest.mark.slow
 def test_where_all_blocks_are_equal_nothing_leads(even):
     assert stand(even, even[0]).score < 0.5
     assert stand(even, even[0], beside(even[0], even[2])).score < 0.5
 
 
-@pytest.mark.slow
 def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeypatch):
     """Also where nothing around the best place is looked at."""
     truth, _, evidence = broken
@@ -112,14 +108,12 @@ def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeyp
     assert both.score <= alone.score
 
 
-@pytest.mark.slow
 def test_on_a_large_map_a_lead_is_worth_less(broken):
     n = 15_000 * 10**4
     small, large = (stand(broken, broken[0], n_reference=count) for count in (866, n))
     assert small.score - large.score > np.log10(larger(n))  # by roads or by the picture, whichever leads more
 
 
-@pytest.mark.slow
 def test_only_what_the_user_allows_is_a_rival(broken):
     truth, _, evidence = broken
     middle = Homography(truth)(evidence.scene.center)
@@ -134,7 +128,6 @@ def test_only_what_the_user_allows_is_a_rival(broken):
     assert not estimator.may_be(turned)
 
 
-@pytest.mark.slow
 def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_mirrored(broken):
     truth, _, evidence = broken
     wrong = beside(truth, evidence)
@@ -151,7 +144,6 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
     assert [other.log10_likelihood for other in others] == pytest.approx([evidence.weigh(place) for place in places])
 
 
-@pytest.mark.slow
 def test_similar_places_point_where_the_image_may(broken):
     """Those that a hint on the heading rules out would crowd out the others, and be compared in vain."""
     truth, _, evidence = broken
@@ -217,7 +209,6 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
     assert asked([item]) is None
 
 
-@pytest.mark.slow
 def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
     certain = rivals._CERTAIN
     monkeypatch.setattr(rivals, "_CERTAIN", np.inf)
@@ -233,7 +224,6 @@ def test_where_nothing_was_met_nothing_is_compared(plain):
     assert asked([item]) is None
 
 
-@pytest.mark.slow
 def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     first, estimator = search_of(broken, broken[0])
     empty, other = search_of(broken)
@@ -245,7 +235,6 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, first]) is None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("is_same", [False, True])
 def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, monkeypatch, is_same):
     both = dict(search_of(broken, broken[0]) for _ in range(2))
@@ -257,7 +246,6 @@ def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, monkey
     assert (proved is not None) is is_same
 
 
-@pytest.mark.slow
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     item, estimator = search_of(broken, broken[0])
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)
@@ -267,7 +255,6 @@ def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     assert asked.compare(item) is first
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("certain", "farther"), [(np.inf, [(rivals._AROUND,)]), (0.0, [])])
 def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_that_may_be_lost(
     even, broken, monkeypatch, certain, farther

@@ -138,7 +138,6 @@ def test_a_known_heading_leaves_few_turns_to_try_whichever_way_it_points(town, b
     assert gap < 20.0
 
 
-@pytest.mark.slow
 def test_work_is_bounded(town, broken, monkeypatch):
     def n_anchors(**limits):
         for name, value in limits.items():

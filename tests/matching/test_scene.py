@@ -60,7 +60,6 @@ class TestSampleRoads:
         assert points.shape == directions.shape == (0, 2)
 
 
-@pytest.mark.slow
 @given(st.lists(st.tuples(st.floats(0, 900), st.floats(-900, 0)), min_size=1, max_size=25), st.integers(1, 9))
 def test_neighbours_in_the_order_of_the_points(points, k):
     xy = np.array(points)

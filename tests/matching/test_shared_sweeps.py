@@ -149,7 +149,6 @@ def search_all(scene, indexes, options=None):
     return list(parts)
 
 
-@pytest.mark.slow
 def test_a_place_is_found_on_any_of_many_towns(towns):
     networks, indexes = towns
     for k, network in enumerate(networks):
@@ -157,7 +156,6 @@ def test_a_place_is_found_on_any_of_many_towns(towns):
         assert [part.stopped for part in parts] == ["accepted" if n == k else "elsewhere" for n in range(4)]
 
 
-@pytest.mark.slow
 def test_a_twin_on_another_part_is_met(towns):
     networks, indexes = towns
     twin = replace(indexes[1], meta={**indexes[1].meta, "origin": [400_000.0, 4_690_000.0]})

@@ -43,7 +43,6 @@ def test_on_another_datum_degrees_are_less_sure_than_metres(town):
     assert placed(town, 15.0, 1.0)[0].lonlat_accuracy_m == 0.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma_m", [1.0, 3000.0])
 def test_a_tilted_view_is_not_however_unsure_its_corners_are(town, sigma_m):
     location, corners = placed(town, 15.0, sigma_m)

@@ -283,7 +283,6 @@ def writing(path: Path) -> Iterator[None]:
         writer.kill()
 
 
-@pytest.mark.slow
 def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
     """Every opening gives one whole reference."""
     path = tmp_path / "REF.gpkg"
@@ -339,7 +338,6 @@ def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> Non
     assert describe_reference(tmp_path / "bare")["name"] == "bare"
 
 
-@pytest.mark.slow
 def test_killed_writers_leave_a_whole_reference(tmp_path: Path) -> None:
     """With its own index or with none; the next writer clears away what they left."""
     path, rng, networks = tmp_path / "REF.gpkg", random.Random(1), two_networks()
@@ -355,7 +353,6 @@ def test_killed_writers_leave_a_whole_reference(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs resource limits")
 @pytest.mark.parametrize("limit", [1000, 60_000, 200_000])
-@pytest.mark.slow
 def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, network: RoadNetwork, limit: int) -> None:
     """A limit on the size of files stands in for a full disk: it strikes the GeoPackage first, or the index."""
     write_reference(tmp_path / "grid.gpkg", network, parts(network))

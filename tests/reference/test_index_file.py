@@ -91,7 +91,6 @@ plain = st.recursive(
 )
 
 
-@pytest.mark.slow
 @given(
     meta=st.dictionaries(st.text(), plain, max_size=5),
     array=hnp.arrays(st.sampled_from(list(index_file._DTYPES.values())), hnp.array_shapes(min_dims=0, min_side=0)),
@@ -132,7 +131,6 @@ def test_what_the_format_does_not_store_is_refused_in_writing(tmp_path: Path, me
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_deep_values_are_refused_in_writing(tmp_path: Path) -> None:
     deep: list[Any] = []
     for _ in range(100_000):
@@ -196,7 +194,6 @@ def refused_or_equal(path: Path) -> bool:
     return False
 
 
-@pytest.mark.slow
 def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     raw = path.read_bytes()
     rng = np.random.default_rng(1)
@@ -209,7 +206,6 @@ def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     assert n_refused > 850  # harmless are only paddings
 
 
-@pytest.mark.slow
 def test_every_truncation_and_extension_is_refused(path: Path) -> None:
     raw = path.read_bytes()
     for size in [*range(0, 4000, 37), *range(len(raw) - 200, len(raw)), *range(4000, len(raw), 4001)]:
@@ -365,7 +361,6 @@ def test_hand_made_pickles_are_refused_and_cost_little_memory(path: Path, pickle
     assert peak < 100e6
 
 
-@pytest.mark.slow
 @given(pickled=st.binary(max_size=60))
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None:

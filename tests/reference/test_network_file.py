@@ -63,7 +63,6 @@ def test_round_trip_is_exact(path: Path, network: RoadNetwork) -> None:
     np.testing.assert_array_equal(found.coverage, network.coverage)
 
 
-@pytest.mark.slow
 @given(
     xy=st.lists(st.floats(-2e6, 2e6), min_size=2, max_size=2),
     origin=st.tuples(st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7)),
@@ -292,7 +291,6 @@ class TestHostileTables:
         with pytest.raises(IndexFormatError, match="is computed"):
             read_network(path)
 
-    @pytest.mark.slow
     def test_a_tree_that_never_ends(self, path, monkeypatch):
         """Pages of a table that all lead to the same page: a few kilobytes hold 400 to the fourth power rows."""
         monkeypatch.setattr("roadgeo.storage.sqlite._STEPS", 1_000_000)

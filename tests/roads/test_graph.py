@@ -37,7 +37,6 @@ def test_a_graph_without_edges(n):
 lines = st.integers(2, 6).flatmap(lambda n: arrays(float, (n, 2), elements=st.floats(-1e3, 1e3)))
 
 
-@pytest.mark.slow
 @given(st.lists(lines, min_size=1, max_size=6))
 def test_packing_keeps_every_line(polylines):
     ends = np.array([[2 * e, 2 * e + 1] for e in range(len(polylines))])

@@ -73,7 +73,6 @@ def branches(draw):
     ]
 
 
-@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(branches(), st.integers(0, 63))
 def test_lines_agree_with_the_slow_twin(lines, turned):

@@ -131,7 +131,6 @@ def small_graphs(draw):
     return RoadGraph.from_polylines(xy, np.array(edges, np.int32), lines)
 
 
-@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(small_graphs())
 def test_join_chains_agrees_with_its_twin(graph):
@@ -166,7 +165,6 @@ def test_pairs_and_clusters_agree_with_their_twins(places):
         np.testing.assert_allclose(centre[list(group)], np.tile(xy[list(group)].mean(axis=0), (len(group), 1)))
 
 
-@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_graphs())
 def test_any_graph_simplifies_to_a_whole_one(graph):
@@ -241,7 +239,6 @@ def test_coverage_surrounds_the_roads_and_what_they_enclose():
     assert area(ring) == pytest.approx(3010**2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 0.8])
 def test_coverage_ends_where_the_roads_end(turn):
     """Whichever way a grid of streets lies, and where a bay cuts into it."""
@@ -280,7 +277,6 @@ lines = st.lists(
 )
 
 
-@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(lines)
 def test_noded_lines_simplify_to_a_whole_graph(drawn):
@@ -293,7 +289,6 @@ def test_noded_lines_simplify_to_a_whole_graph(drawn):
     assert (result.edge_lengths()[dead] >= SimplifyOptions().stub_length).all()
 
 
-@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_graphs())
 def test_edges_are_measured(graph):
@@ -302,7 +297,6 @@ def test_edges_are_measured(graph):
     np.testing.assert_allclose(measured, graph.edge_lengths())
 
 
-@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_graphs(), st.lists(st.floats(0.05, 0.95), min_size=28, max_size=28))
 def test_edges_are_cut_as_by_the_twin(graph, shares):
@@ -319,7 +313,6 @@ def test_edges_are_cut_as_by_the_twin(graph, shares):
         )
 
 
-@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_graphs(), st.floats(5, 30))
 def test_edges_that_run_side_by_side_are_found_as_by_the_twin(graph, distance):
@@ -341,7 +334,6 @@ def test_edges_that_run_side_by_side_are_found_as_by_the_twin(graph, distance):
     assert found.tolist() == [first[e] for e in range(graph.n_edges)]
 
 
-@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_graphs(), st.floats(2, 25))
 def test_mates_and_touches_agree_with_their_twin(graph, distance):
@@ -416,7 +408,6 @@ def test_a_run_ends_where_a_gap_opens():
     assert ties.tolist() == [[0, 0, 1, 0], [0, 30, 1, 30]]
 
 
-@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(lines, st.floats(5, 40))
 @example([[(0, 95), (139, 118), (0, 75)], [(125, 52), (142, 150)]], 5.0)  # half a square metre, but for rounding
@@ -452,7 +443,6 @@ class TestLinesThatAreNoRoads:
         with pytest.raises(RoadSourceError, match=match):
             coverage(planarize(lines))
 
-    @pytest.mark.slow
     def test_a_net_of_meridians_and_parallels(self):
         """Drawn every 10 degrees, 54 lines: not many crossings, but a quarter of a million squares for each."""
         way = np.linspace(-2e7, 2e7, 19)
@@ -461,7 +451,6 @@ class TestLinesThatAreNoRoads:
             across + [LineString([(x, y) for x in way]) for y in way[:-1]], "squares of 150 m, expected at most"
         )
 
-    @pytest.mark.slow
     def test_lines_that_all_cross(self):
         rng = np.random.default_rng(0)
         self.refuse(shapely.linestrings(rng.random((20_000, 2, 2)) * 1e4), "may cross each other 199,990,000 times")
@@ -470,14 +459,12 @@ class TestLinesThatAreNoRoads:
         rng = np.random.default_rng(0)
         self.refuse([LineString(rng.random((20_000, 2)) * 1e4)], "may cross each other")
 
-    @pytest.mark.slow
     def test_one_road_many_times_over(self):
         self.refuse([LineString([(0, 0), (500, k * 1e-6)]) for k in range(20_000)], "each of them many times over")
 
     def test_lines_beyond_the_earth(self):
         self.refuse([LineString([(0, 0), (1e12, 0)])], "km long, expected at most 10,000,000")
 
-    @pytest.mark.slow
     def test_dense_streets_are_roads(self):
         ways = [LineString([(0, y), (3000, y)]) for y in range(0, 3000, 15)]
         graph = planarize(ways + [LineString([(x, 0), (x, 3000)]) for x in range(0, 3000, 15)])

@@ -13,7 +13,6 @@ from roadgeo.roads.thresholds import Sample, find_numbered, find_thresholds
 KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
 
 
-@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=150)
 def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:

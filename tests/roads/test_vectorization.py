@@ -197,7 +197,6 @@ def test_all_road_is_an_error() -> None:
         vectorize(RoadMask(np.ones((50, 50), bool)))
 
 
-@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1.0, 2.0, 4.0]), st.floats(0.02, 0.6), st.booleans())
 def test_any_noise_gives_a_sound_graph(seed: int, scale: float, share: float, unseen: bool) -> None:
@@ -266,7 +265,6 @@ def test_road_width_is_told_from_the_roads_alone() -> None:
         road_width(RoadMask(np.zeros((300, 300), bool)))
 
 
-@pytest.mark.realdata
 def test_every_real_mask_gives_a_graph(data_dir: Path) -> None:
     for path in sorted((data_dir / "massachusetts" / "masks").glob("*.png")):
         result = vectorize(RoadMask(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127))
@@ -282,7 +280,6 @@ def test_every_real_mask_gives_a_graph(data_dir: Path) -> None:
         ("squares", "would cover 2"),
     ],
 )
-@pytest.mark.slow
 def test_what_is_no_road_is_refused_before_it_takes_long(kind: str, message: str) -> None:
     """A checkerboard of single pixels took a minute and 2 GB at 1500 x 1500, and 8 GB at 3000 x 3000."""
     y, x = np.mgrid[:2600, :2600] if kind == "checkerboard" else np.mgrid[:700, :700]

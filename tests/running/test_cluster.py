@@ -24,8 +24,6 @@ from roadgeo.reference.shards import open_shards
 pytest.importorskip("distributed")
 from roadgeo.running.cluster import Cluster
 
-pytestmark = pytest.mark.slow
-
 TESTS = Path(__file__).parents[1]
 
 

@@ -63,7 +63,6 @@ def town(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_a_divided_map_answers_as_the_whole_does(town, monkeypatch, capsys):
     monkeypatch.chdir(town)
     asked = [
@@ -95,7 +94,6 @@ def test_a_divided_map_answers_as_the_whole_does(town, monkeypatch, capsys):
     )
 
 
-@pytest.mark.slow
 def test_a_place_counts_only_against_all_of_the_map(town, monkeypatch, capsys):
     """Where two maps hold a place, neither worker may report it alone."""
     monkeypatch.chdir(town)
@@ -109,7 +107,6 @@ def test_a_place_counts_only_against_all_of_the_map(town, monkeypatch, capsys):
         assert json.loads(capsys.readouterr().out)["status"] == "ambiguous"
 
 
-@pytest.mark.slow
 def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(town / "town.shards", "town.shards")

@@ -13,8 +13,6 @@ from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
 from roadgeo.workflows import explain
 
-pytestmark = pytest.mark.slow
-
 VIEW = ViewOptions(
     size_px=(700, 700), gsd_m=(1.2, 1.2), heading_deg=(0.0, 360.0), tilt_deg=(0.0, 0.0), intersections=(25, 1000)
 )

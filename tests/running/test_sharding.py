@@ -29,8 +29,6 @@ from roadgeo.roads.network import build_network
 from roadgeo.running import sharding
 from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
 
-pytestmark = pytest.mark.slow
-
 SIDE = 5000.0
 OPTIONS = ShardOptions(size_m=2500.0, margin_m=1000.0)
 

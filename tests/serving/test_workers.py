@@ -37,8 +37,6 @@ from roadgeo.running.pool import Died
 from roadgeo.serving.workers import ImageRequest, Serving, Workers, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
-pytestmark = pytest.mark.slow
-
 #: The program that serves.
 SERVE = [sys.executable, "-m", "roadgeo", "serve"]
 

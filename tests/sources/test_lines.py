@@ -43,7 +43,6 @@ def test_every_format_gives_the_same_lines(tmp_path, name):
     assert (read.meta.get("attribution") == OSM_ATTRIBUTION) == (".osm" in name)
 
 
-@pytest.mark.slow
 def test_graphml_of_osmnx(tmp_path):
     import networkx as nx
     import osmnx as ox

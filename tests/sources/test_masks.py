@@ -481,7 +481,6 @@ def test_voids_are_told_on_request(tmp_path: Path) -> None:
     assert read_mask(image, voids=False).observed is None
 
 
-@pytest.mark.realdata
 def test_real_masks_are_read_and_photographs_refused(data_dir: Path) -> None:
     masks = sorted((data_dir / "massachusetts").glob("**/masks/*.png"))[::4]
     assert masks

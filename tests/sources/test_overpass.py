@@ -13,8 +13,6 @@ from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place, read
 from roadgeo.sources.roads import fetch_roads
 from roadgeo.storage.folders import cache_dir
 
-pytestmark = pytest.mark.slow  # a server, asked again and again
-
 
 @pytest.fixture
 def osm(tmp_path, monkeypatch):
@@ -53,7 +51,6 @@ def test_the_roads_of_a_place(osm, pauses):
     assert '["tunnel"!~"^(yes|avalanche_protector)$"]' in query
 
 
-@pytest.mark.slow
 def test_answers_are_kept_and_grow_old(osm, pauses):
     first = fetch_roads("Fenway, Boston", options=ask(osm))
     said = []

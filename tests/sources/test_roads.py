@@ -265,7 +265,6 @@ def test_the_counts_are_those_of_the_documentation():
 SMALL = {Path(name).suffix: name for name, (n, *_) in sorted(REAL.items(), key=lambda row: -row[1][0]) if n < 3000}
 
 
-@pytest.mark.realdata
 @pytest.mark.parametrize("name", SMALL.values())
 def test_counts_agree_with_an_independent_count(data_dir, name):
     file = data_dir / name

@@ -106,7 +106,6 @@ def bomb(path: Path, which: str) -> None:
             file.write_table(table)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not abi_version(), reason="only inside a fence, which this system has not")
 @pytest.mark.parametrize(
     ("which", "message"),
@@ -125,7 +124,6 @@ def test_few_bytes_that_stand_for_many_end_in_a_line(which: str, message: str, t
     assert int(megabytes) < 1500
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not abi_version(), reason="only inside a fence, which this system has not")
 def test_a_small_file_is_read_within_its_bound(tmp_path: Path) -> None:
     """Arrow's usual allocator reserves 1 GB, as much as a small file may take."""

@@ -12,7 +12,6 @@ from roadgeo.cli import main
 from roadgeo.evaluation.demo import ROADS, demo_masks
 
 
-@pytest.mark.slow
 def test_all_that_is_written_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
     monkeypatch.chdir(tmp_path)
@@ -25,7 +24,6 @@ def test_all_that_is_written_is_valid(tmp_path: Path, monkeypatch: pytest.Monkey
     assert {path.name: validate(path) for path in written} == {path.name: "" for path in written}
 
 
-@pytest.mark.slow
 def test_the_validator_notices_what_is_wrong(tmp_path: Path) -> None:
     path = tmp_path / "a.gpkg"
     shutil.copy(ROADS, path)

@@ -17,8 +17,6 @@ from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 
-pytestmark = pytest.mark.realdata
-
 VIEWS = 2  # of each mask that lies on the map; of the others one
 
 

@@ -16,8 +16,6 @@ from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
 
-pytestmark = pytest.mark.realdata
-
 FEW = ("boston_2", "miami_26")
 
 
