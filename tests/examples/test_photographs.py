@@ -1,0 +1,45 @@
+"""`examples/photographs`: the photograph of the demonstration in each mode, and the counts."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadgeo.evaluation.demo import ROADS, STREETS
+
+PHOTOGRAPHS = Path(__file__).parents[2] / "examples" / "photographs" / "photographs.py"
+TRUTH = """file,label,lon,lat,gsd_m,heading_deg,kind,roads
+berkeley_photo.jpg,,-122.2593,37.8717,0.9426,0,NAIP,berkeley_streets.gpkg
+unknown.jpg,,0,0,1,0,,
+"""
+KEPT = """mode,file,maps,status,right,code,off_m,score,cpu_s,commit
+blind,a.jpg,m,located,1,located,1.0,9.00,2.00,c
+blind,b.jpg,m,not_located,0,nothing_stands_out,,2.50,4.00,c
+"""
+
+
+def run(folder: Path, *arguments: object) -> str:
+    command = [sys.executable, "-W", "error", PHOTOGRAPHS, *arguments]
+    command += ["--out", folder / "results.csv", "--built", folder / "built"]
+    return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.slow
+def test_a_photograph_is_searched_once_in_each_mode(tmp_path: Path) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    (folder / "truth.csv").write_text(TRUTH)
+    for path in (STREETS, STREETS.with_name("berkeley_photo.jpg")):
+        shutil.copy(path, tmp_path if path == STREETS else folder)
+    run(tmp_path, "told", folder)
+    run(tmp_path, "elsewhere", folder, "--maps", ROADS, tmp_path / STREETS.name)
+    counted = run(tmp_path, "told", folder)  # nothing is searched again
+    assert "| told | 1 of 1 (3 to 100 %) | 0 of 1 (0 to 98 %) |" in counted
+    assert "| elsewhere | - | 0 of 1 (0 to 98 %) |" in counted
+
+
+def test_counts_of_the_kept_results_are_printed(tmp_path: Path) -> None:
+    (tmp_path / "results.csv").write_text(KEPT)
+    assert "| blind | 1 of 2 (1 to 99 %) | 0 of 2 (0 to 84 %) | 2.5 | 2 | 4 |" in run(tmp_path, "table")
