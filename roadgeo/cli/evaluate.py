@@ -36,7 +36,7 @@ _OPTIONS = (
     row("--queries", "PATH", OTHERS,
         "A query set: its folder, or its table.", type=click.Path(exists=True, path_type=Path)),
     query_options,
-    row("--method", ("auto", "pair"), OTHERS, "As in locate.", default="auto", show_default=True),
+    take("methods"),
     take("gsd", called="--known-gsd", help="Pixel size as it is told to the search, metres."),
     take("max_tilt", "north_up", "effort", "time_limit"),
     row("--radius", "METRES", OTHERS,
@@ -62,6 +62,8 @@ def evaluate_command(
     queries: Path | None,
     roads: Path | None,
     method: Literal["auto", "pair"],
+    paper: bool,
+    pair: tuple[str, ...],
     radius: float,
     jobs: int,
     as_map: bool,
@@ -101,10 +103,11 @@ def evaluate_command(
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     compile_once()
     hints = hinted(options)
-    locator = ReferenceLocator((path,), make_options(hints, method))
+    locator = ReferenceLocator((path,), make_options(hints, method, paper=paper, pair=pair))
     options = {name: value for name, value in options.items() if name not in _HINTED}
     known = {_HINTED[name]: value for name, value in hints.items() if value != "full"}
-    about = {"reference": path.stem, "method": method, **known}
+    thresholds = {key: value for key, value in {"paper": paper, "pair": " ".join(pair)}.items() if value}
+    about = {"reference": path.stem, "method": method, **thresholds, **known}
     if as_map:
         survey = _survey(locator, options, about)
         survey = replace(survey, check=check, jobs=jobs, out_dir=folder, counting=count_up)

@@ -159,9 +159,7 @@ _OPTIONS = (
     row("--page", "N", IMAGE,
         "Page of a TIFF that holds several. Default: the first.", type=click.IntRange(1), rare=True),
     take("jobs"),
-    row("--method", ("auto", "pair"), SEARCH,
-        "auto: the best there is, the default. pair: exactly the paper's matcher.", default="auto", rare=True),
-    take("cluster"),
+    take("methods", "cluster"),
     row("--divide-map", "", SEARCH,
         "On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that no"
         " machine holds.", rare=True),
@@ -184,7 +182,7 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
     """Find where images lie on a map, and draw them there; for the help see above."""
     from roadgeo.cli.progress import count_up, show_steps
 
-    options = make_options(hinted(given), given["method"])
+    options = make_options(hinted(given), given["method"], paper=given["paper"], pair=given["pair"])
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
     tasks = find_tasks(masks, given, out_dir)

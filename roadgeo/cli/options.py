@@ -397,6 +397,15 @@ _SHARED = {
     "jobs": row("-j --jobs", "N", SEARCH,
         "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
         "Default: 1.", type=click.IntRange(1), default=1, show_default=False),
+    "method": row("--method", ("auto", "pair"), SEARCH,
+        "auto: the best there is, the default. pair: the matcher of the paper that roadgeo began with, for comparison.",
+        default="auto", rare=True),
+    "paper": row("--paper", "", SEARCH,
+        "With --method pair: the paper to the letter. Without it matches are one to one, cameras are real, and places"
+        " are refined.", rare=True),
+    "pair": row("--pair", "NAME=VALUE", SEARCH,
+        "With --method pair: one of its thresholds, by the paper's symbols, such as delta=0.2 or d_max_m=1500."
+        " Repeatable.", multiple=True, rare=True),
     "engine": row("--engine", ("local", "dask"), SEARCH,
         "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers, which "
         "survives their death. Needs dask and distributed.", rare=True),
@@ -412,6 +421,7 @@ _TOGETHER = {
     "segmenting": ("segment", "segmenter", "class_name"),
     "mask_values": ("threshold", "band", "bands"),
     "cluster": ("engine", "scheduler"),
+    "methods": ("method", "paper", "pair"),
     "verbosity": ("quiet", "verbose"),
 }
 
@@ -437,23 +447,32 @@ def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
     return {name: given[name] for name in names if given.get(name) is not None and given[name] is not False}
 
 
-def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOptions:
+def make_options(
+    known: Mapping[str, Any], method: Any = "auto", *, paper: bool = False, pair: Sequence[str] = ()
+) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is.
 
     Raises
     ------
     click.UsageError
-        The paper's method knows no hints.
+        The paper's method knows no hints; only that method has its thresholds.
     """
     from dataclasses import replace
 
+    from roadgeo.matching.paper import PAPER, PairOptions, read_options
     from roadgeo.workflows import LocateOptions
 
     if method == "pair":
         idle = [hint for hint in HINTS.values() if hint.group != SEARCH and known.get(hint.goes_to, False) is not False]
         if idle:
             raise click.UsageError(f"--method pair takes no {', '.join(hint.option for hint in idle)}: leave it out.")
-    return apply_hints(replace(LocateOptions(), method=method), known)
+    elif paper or pair:
+        raise click.UsageError("--paper and --pair go with --method pair.")
+    try:
+        thresholds = read_options(pair, PAPER if paper else PairOptions())
+    except ValueError as error:
+        raise click.UsageError(f"--pair {error}.") from error
+    return apply_hints(replace(LocateOptions(), method=method, pair=thresholds), known)
 
 
 def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None) -> list[Task]:

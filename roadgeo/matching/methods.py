@@ -18,9 +18,9 @@ from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Events, Ledger
 from roadgeo.matching.finishing import measure_corners, measured
 from roadgeo.matching.growing import SharedSweeps
-from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
+from roadgeo.matching.index import ReferenceIndex, crop
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.pairs import PairIndex, build_pair_index, well_fitted
+from roadgeo.matching.pairs import paired
 from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.parts import Part, Whole
 from roadgeo.matching.picture import by_picture
@@ -30,7 +30,6 @@ from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Ahead, Search, search_in_turn, search_together
 from roadgeo.matching.triples import larger, n_units
-from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
 __all__ = ["N_PLACES", "Proposed", "Searched", "less_than", "search_references"]
@@ -349,9 +348,9 @@ def _search_pairs_in_turn(
 
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> Searched:
     """Run the paper's method; its places have no scores."""
-    scene = query.scene
-    table = _pair_index(index, options.d_max_m)
-    match = match_pairs(scene.intersections, table, scene.corners, options)
+    scene, table = query.scene, paired(index, options.tuples)
+    found = query.intersections_by(options.n_px) if options.from_center else scene.intersections
+    match = match_pairs(found, table, scene.corners, options)
     searched = Searched(
         index,
         stopped=match.stopped,
@@ -363,14 +362,6 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> 
     if match.homography is None:
         return searched
     matched = np.full(len(scene.intersections), -1, np.int64)
-    matched[match.matches[:, 0]] = table.reference.node[match.matches[:, 1]]
+    rows = np.searchsorted(scene.intersections.node, found.node[match.matches[:, 0]])
+    matched[rows] = table.reference.node[match.matches[:, 1]]
     return replace(searched, places=(Place(scene, index, match.homography, grown=matched, score=math.nan),))
-
-
-@lru_cache(maxsize=4)
-def _pair_index(index: ReferenceIndex, d_max_m: float) -> PairIndex:
-    """Build the paper's tables for a reference: too large to store with it, kept for a batch."""
-    n = len(index)
-    rays = unpack_branches(index.branches)
-    found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
-    return build_pair_index(found.only(np.flatnonzero(well_fitted(index))), d_max_m)

@@ -10,42 +10,63 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.errors import IndexFormatError
 from roadgeo.kernels.pairs import PairBuckets
 from roadgeo.kernels.roads import road_residuals
-from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket
+from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket, unpack_tangents
 from roadgeo.matching.scene import MIN_COS
-from roadgeo.roads.intersections import Intersections
+from roadgeo.roads.intersections import IntersectionOptions, Intersections, describe, unpack_branches
 
 __all__ = [
-    "D_MAX_M",
     "PairIndex",
+    "TupleOptions",
     "build_pair_index",
     "cotangents",
     "cross_ratios",
     "list_pairs",
+    "paired",
     "type_codes",
     "type_keys",
-    "well_fitted",
 ]
 
 #: A dense city of 15,000 intersections has some millions; each takes about 100 bytes while the tables are built.
 _MAX_TUPLES = 30_000_000
-#: Greatest distance between the two intersections of a tuple, metres (eq. 8).
-D_MAX_M = 1000.0
-#: Least angle between a tangent and the connecting line, degrees (eq. 7).
-_LEAST_ANGLE_DEG = 15.0
-#: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
-#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`) and are sampled every `_STEP_M`. Roads
-#: further off than `_REACH_M`, or turned from the branch by more, are other roads.
-_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M = 15.0, 0.5, 8.0, 3.0, 6.0
+#: Tangents of the reference begin so far from the intersection (see `IntersectionOptions`), and are sampled every
+#: `_STEP_M`. Roads further off than `_REACH_M`, or turned from the branch by more, are other roads.
+_SKIP_M, _STEP_M, _REACH_M = 8.0, 3.0, 6.0
+
+
+@dataclass(frozen=True)
+class TupleOptions:
+    """Which tuples are formed, by the paper's symbols.
+
+    Attributes
+    ----------
+    d_max_m : float
+        Greatest distance between the two intersections of a reference tuple (eq. 8).
+    delta_angle_deg : float
+        Least angle between a tangent and the connecting line (eq. 7).
+    n_px : int
+        Pixels of a branch that must lie on a line, metres on the map (section 4.2).
+    fit_error_px : float
+        Their greatest average distance from that line; the map's other intersections form no tuples.
+    from_center : bool
+        Those pixels begin at the intersection, and the line is the branch's tangent (section 3.1). False: tangents are
+        those of the traced roads, which are fitted further out, where the width of the roads does not bend them.
+    """
+
+    d_max_m: float = 1000.0
+    delta_angle_deg: float = 15.0
+    n_px: int = 15
+    fit_error_px: float = 0.5
+    from_center: bool = False
 
 
 class Tuples(NamedTuple):
@@ -77,10 +98,14 @@ class PairIndex:
         return sum(len(tuples.pairs) for tuples in self.tuples.values())
 
 
-def build_pair_index(intersections: Intersections, d_max_m: float = D_MAX_M) -> PairIndex:
-    """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
+@lru_cache(maxsize=4)
+def paired(index: ReferenceIndex, options: TupleOptions) -> PairIndex:
+    """Build the paper's tables for a reference, kept for a batch: to store them would save a second or two of it."""
+    return build_pair_index(_fitted(index, options), options)
 
-    Their ends lie at most `d_max_m` metres from each other (eq. 8).
+
+def build_pair_index(intersections: Intersections, options: TupleOptions) -> PairIndex:
+    """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
 
     Raises
     ------
@@ -91,7 +116,7 @@ def build_pair_index(intersections: Intersections, d_max_m: float = D_MAX_M) -> 
 
     xy = intersections.xy
     codes = type_codes(intersections)
-    pairs = list_pairs(intersections, np.arange(len(xy)), d_max_m)
+    pairs = list_pairs(intersections, np.arange(len(xy)), options.d_max_m, options.delta_angle_deg)
     keys = type_keys(codes, pairs)
     order = np.argsort(keys, kind="stable")
     tuples = {}
@@ -106,7 +131,7 @@ def build_pair_index(intersections: Intersections, d_max_m: float = D_MAX_M) -> 
     return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
 
 
-def list_pairs(found: Intersections, chosen: IntArray, d_max: float) -> IntArray:
+def list_pairs(found: Intersections, chosen: IntArray, d_max: float, least_deg: float) -> IntArray:
     """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
 
     Raises
@@ -126,7 +151,7 @@ def list_pairs(found: Intersections, chosen: IntArray, d_max: float) -> IntArray
             )
     pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
     dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
-    phi, least = np.arctan2(dy, dx), math.sin(math.radians(_LEAST_ANGLE_DEG))
+    phi, least = np.arctan2(dy, dx), math.sin(math.radians(least_deg))
     passes = (dx != 0.0) | (dy != 0.0)
     for ends in pairs.T:
         passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
@@ -173,21 +198,49 @@ def _fours(n: int) -> tuple[IntArray, IntArray]:
     return three, four
 
 
-def well_fitted(index: ReferenceIndex) -> BoolArray:
-    """Return which intersections (N,) have only branches that are long and straight enough (section 4.2)."""
+def _fitted(index: ReferenceIndex, options: TupleOptions) -> Intersections:
+    """Return the intersections (N,) whose branches are all long and straight enough, with the tangents asked for.
+
+    Their `node` is their row in the index.
+    """
+    at, lines, error = _fit_lines(index, 0.0 if options.from_center else _SKIP_M, options.n_px)
+    good = np.ones(len(index), bool)
+    good[at[~(error <= options.fit_error_px)]] = False  # NaN: it is too short
+    if options.from_center:
+        starts = np.searchsorted(at, np.arange(len(index) + 1))
+        found = describe(index.xy, starts, lines, IntersectionOptions())
+    else:
+        rays, tangents = unpack_branches(index.branches), unpack_tangents(index.tangents)
+        found = Intersections(index.xy, rays, tangents, np.zeros(len(index), np.float32), np.arange(len(index)))
+    return found.only(np.flatnonzero(good))
+
+
+def _fit_lines(index: ReferenceIndex, start_m: float, length_m: float) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Fit a line to each branch of a reference.
+
+    Returns
+    -------
+    at : (B,) int64
+        Intersections that own the branches, ascending.
+    lines : (B, 4) float64
+        As `kernels.intersections.fit_branches` gives them.
+    error : (B,) float64
+        Average distance of the road from its line, metres; NaN where the branch is shorter than `length_m`.
+    """
     vectors = index.branches.astype(float) / 127.0
     at, column = np.nonzero(vectors.any(axis=2))
     ahead = vectors[at, column]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    steps = _SKIP_M + np.arange(0.0, _LENGTH_M + 1e-9, _STEP_M)
+    steps = start_m + np.arange(0.0, length_m + 1e-9, _STEP_M)
     points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
     along, out = np.repeat(ahead, len(steps), axis=0), np.empty((len(points), 3))
     road_residuals(np.eye(3), points, along, np.full(len(points), _REACH_M), MIN_COS, index.road_buckets, out)
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
-    # Residuals of the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
-    basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
-    error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
-    good = np.ones(len(index), bool)
-    good[at[~(error <= _MAX_ERROR_M)]] = False
-    return good
+    across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    offsets = (out[:, 0] * (out[:, 1:] * across.repeat(len(steps), axis=0)).sum(axis=1)).reshape(-1, len(steps))
+    # The line need not meet the intersection.
+    away, slope = np.linalg.lstsq(np.column_stack([np.ones(len(steps)), steps]), offsets.T, rcond=None)[0]
+    left = offsets - away[:, None] - slope[:, None] * steps
+    direction = np.arctan2(ahead[:, 1], ahead[:, 0]) + np.arctan(slope)
+    through = index.xy[at] + away[:, None] * across
+    turned = (direction + np.pi) % (2.0 * np.pi) - np.pi
+    return at, np.column_stack([through, turned, (left**2).mean(axis=1)]), np.abs(left).mean(axis=1)

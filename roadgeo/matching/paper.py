@@ -20,22 +20,29 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.pairs import count_inliers
-from roadgeo.matching.pairs import D_MAX_M, PairIndex, cotangents, cross_ratios, list_pairs, type_codes, type_keys
+from roadgeo.matching.pairs import (
+    PairIndex,
+    TupleOptions,
+    cotangents,
+    cross_ratios,
+    list_pairs,
+    type_codes,
+    type_keys,
+)
 from roadgeo.matching.refinement import denormalise, normalise
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["PairMatch", "PairOptions", "match_pairs"]
+__all__ = ["PAPER", "PairMatch", "PairOptions", "match_pairs", "read_options"]
 
-#: Greatest probability to miss a place that is there (lambda, eq. 13).
-_LAMBDA = 0.01
 #: Most intersections of a query that form tuples, chosen at random; all intersections still judge hypotheses.
 _MAX_TUPLE_INTERSECTIONS = 1000
 #: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
@@ -46,48 +53,115 @@ _SAMPLE_S, _TESTED_S, _COUNTED_S = 0.35e-3, 0.1e-6, 0.04e-6
 
 
 @dataclass(frozen=True)
-class PairOptions:
-    """Thresholds of the paper, by its symbols. Those that the paper states are 0.3, 0.5 and 30.
+class PairOptions(TupleOptions):
+    """Thresholds of the paper, by its symbols. Those that the paper states are 0.3, 0.5 and 30, and 15 and 0.5 pixels.
 
     Attributes
     ----------
-    d_max_m : float
-        Greatest distance between the two intersections of a reference tuple (eq. 8).
-    delta_cross_ratio : float
+    delta : float
         Relative error allowed in every cross ratio (eq. 6).
-    tangent_orders : {"++", "all"}
-        Correspondences of the tangents tried (section 3.2). "++": both ends in the same rotational sense, the only
-        physical case, with w > 0 all over the frame; "all": all four, without restriction.
+    delta_inlier : float
+        Inlier ratio above which a place is located.
+    inlier_distance_m : float
+        Greatest distance of a mapped intersection from one of the same type that it matches (delta of eq. 10).
+    min_intersections : int
+        Queries with fewer are not searched.
+    lambda_ : float
+        Greatest probability to miss a place that is there (eq. 13).
     lambda_1 : float
         Greatest probability to miss a tuple's counterpart that is there (eq. 14).
     p_query : float
         Probability that a query tuple has its counterpart in the reference (eq. 12).
-    delta_inlier : float
-        Inlier ratio above which a place is found.
-    inlier_distance_m : float
-        Greatest distance of a mapped intersection from one of the same type that it matches (eq. 10).
+    orders : {"++", "all"}
+        Correspondences of the tangents tried (section 3.2). "++": both ends in the same rotational sense, the only
+        physical case, with w > 0 all over the frame; "all": all four, without restriction.
     one_to_one : bool
         Let each reference intersection match once only. False: eq. 10 to the letter.
-    min_intersections : int
-        Queries with fewer are not searched.
     rarest_first : bool
         Draw query tuples of types rare in the reference first (section 3.3). False: all types alike.
+    refined : bool
+        Fit the homography of a place to all its matches. False: it is that of the tuple, by eq. 9.
     work_limit_s, time_limit_s : float
         The search stops after this amount of work, counted in seconds of a usual machine, or this time by the clock.
     """
 
-    d_max_m: float = D_MAX_M
-    delta_cross_ratio: float = 0.3
-    tangent_orders: Literal["++", "all"] = "++"
-    lambda_1: float = 0.05
-    p_query: float = 0.01
+    delta: float = 0.3
     delta_inlier: float = 0.5
     inlier_distance_m: float = 20.0
-    one_to_one: bool = True
     min_intersections: int = 30
+    lambda_: float = 0.01
+    lambda_1: float = 0.05
+    p_query: float = 0.01
+    orders: Literal["++", "all"] = "++"
+    one_to_one: bool = True
     rarest_first: bool = True
+    refined: bool = True
     work_limit_s: float = 10.0
     time_limit_s: float = 60.0
+
+    @property
+    def tuples(self) -> TupleOptions:
+        """Those of its options that determine a reference's tuples."""
+        return TupleOptions(**{option.name: getattr(self, option.name) for option in fields(TupleOptions)})
+
+
+#: The paper to the letter; what it leaves open stays as it is.
+PAPER = PairOptions(from_center=True, orders="all", one_to_one=False, refined=False)
+
+_SHARE = (1e-6, 1.0 - 1e-6)
+_YES_NO = {"yes": True, "no": False}
+#: Least and most of each number; the texts that others may be.
+_ALLOWED: dict[str, Any] = {
+    "d_max_m": (1.0, 1e5),
+    "delta_angle_deg": (0.0, 45.0),
+    "n_px": (6, 200),
+    "fit_error_px": (0.0, 10.0),
+    "from_center": _YES_NO,
+    "delta": _SHARE,
+    "delta_inlier": _SHARE,
+    "inlier_distance_m": (0.1, 1000.0),
+    "min_intersections": (2, 5000),
+    "lambda": _SHARE,
+    "lambda_1": _SHARE,
+    "p_query": _SHARE,
+    "orders": {"++": "++", "all": "all"},
+    "one_to_one": _YES_NO,
+    "rarest_first": _YES_NO,
+    "refined": _YES_NO,
+}
+
+
+def read_options(given: Sequence[str], options: PairOptions) -> PairOptions:
+    """Set options that are given as NAME=VALUE: "delta=0.2", "lambda=0.05" or "one_to_one=no".
+
+    Raises
+    ------
+    ValueError
+        There is no such option, or no such value.
+    """
+    for setting in given:
+        name, _, value = setting.partition("=")
+        if name not in _ALLOWED:
+            raise ValueError(f"{setting!r}, expected NAME=VALUE, NAME one of {', '.join(_ALLOWED)}")
+        own = "lambda_" if name == "lambda" else name
+        options = replace(options, **{own: _read(setting, value, _ALLOWED[name])})
+    return options
+
+
+def _read(setting: str, value: str, allowed: Any) -> Any:
+    """Return the value of a setting: one of several texts, or a number within bounds of its type."""
+    if isinstance(allowed, dict):
+        if value not in allowed:
+            raise ValueError(f"{setting!r}, expected {' or '.join(allowed)}")
+        return allowed[value]
+    low, high = allowed
+    try:
+        number = type(low)(value)
+    except ValueError:
+        number = math.nan
+    if not low <= number <= high:
+        raise ValueError(f"{setting!r}, expected {low:g} to {high:g}")
+    return number
 
 
 @dataclass(frozen=True)
@@ -231,23 +305,23 @@ class _Search:
         chosen = np.arange(len(self.query))
         if len(chosen) > _MAX_TUPLE_INTERSECTIONS:
             chosen = rng.choice(chosen, _MAX_TUPLE_INTERSECTIONS, replace=False)
-        pairs = list_pairs(self.query, chosen, np.inf)
+        pairs = list_pairs(self.query, chosen, np.inf, options.delta_angle_deg)
         keys = type_keys(self.codes, pairs)
         order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))
         if options.rarest_first:
             order = order[np.argsort([len(tuples[key].pairs) for key in keys[order].tolist()], kind="stable")]
-        drawn = order[: query_draws(_LAMBDA, options.lambda_1, options.p_query)]
+        drawn = order[: query_draws(options.lambda_, options.lambda_1, options.p_query)]
         return list(zip(pairs[drawn].tolist(), keys[drawn].tolist(), strict=True))
 
     def correspondences(self, a: int, b: int, key: int) -> list[_Correspondence]:
         """Find the candidates of the query tuple (a, b) by the matching rules (section 3.2, eq. 6)."""
         options, (pairs, tree) = self.options, self.index.tuples[key]
-        low, high = math.log1p(-options.delta_cross_ratio), math.log1p(options.delta_cross_ratio)
+        low, high = math.log1p(-options.delta), math.log1p(options.delta)
         found = []
         for ends in np.array([(a, b), (b, a)] if self.codes[a] == self.codes[b] else [(a, b)]):
             step = self.query.xy[ends[1]] - self.query.xy[ends[0]]
             falling = [cotangents(self.query, ends[k : k + 1], step[:1], step[1:])[0] for k in (0, 1)]
-            for signs in [(1, 1)] if options.tangent_orders == "++" else [(1, 1), (1, -1), (-1, 1), (-1, -1)]:
+            for signs in [(1, 1)] if options.orders == "++" else [(1, 1), (1, -1), (-1, 1), (-1, -1)]:
                 # Clockwise, angles count the other way round: cotangents change sign and, to fall again, order.
                 first, second = (sign * cot[::sign] for sign, cot in zip(signs, falling, strict=True))
                 candidates = pairs
@@ -308,7 +382,7 @@ class _Search:
         (ex, ey), (x, y) = (second - first) / np.sum((second - first) ** 2), first
         into_pair = np.array([[ex, ey, -ex * x - ey * y], [-ey, ex, ey * x - ex * y], [0.0, 0.0, 1.0]])
         models = from_pair @ between @ into_pair
-        if self.options.tangent_orders == "all":
+        if self.options.orders == "all":
             return np.asarray(models)
         in_front = (np.column_stack([self.frame, np.ones(4)]) @ models[:, 2].T > 0.0).all(axis=0)
         return np.asarray(models[(a1 > 0.0) & (a2 > 0.0) & in_front])
@@ -338,13 +412,13 @@ class _Search:
         return np.column_stack([found, nearest[found]])
 
     def located(self, homography: FloatArray) -> PairMatch:
-        """Refine the best homography on its matches, as long as that matches more, and report it."""
+        """Report the best homography; it is first refined on its matches, as long as that matches more."""
         matches = self.matches(homography)
-        for _ in range(5):
+        for _ in range(5 if self.options.refined else 0):
             refined = fit_points(homography, self.query.xy[matches[:, 0]], self.index.reference.xy[matches[:, 1]])
             rematched = self.matches(refined)
             w = Homography(refined).w(self.frame)
-            is_allowed = self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
+            is_allowed = self.options.orders == "all" or bool(np.all(w * w[0] > 0))
             if len(rematched) < len(matches) or not is_allowed:
                 break
             is_stable = np.array_equal(rematched, matches)

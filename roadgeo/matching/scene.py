@@ -237,13 +237,17 @@ def trace_query(mask: RoadMask) -> tuple[Scene, RoadGraph]:
     width = traced.road_width_px
     near = SimplifyOptions(merge_radius=_MERGE * width, fuse_distance=_FUSE * width, stub_length=_STUB * width)
     graph = simplify(traced.graph, near)
-    lengths = IntersectionOptions(
-        tangent_length=_TANGENT * width, skip_length=_SKIP * width, min_branch_length=_BRANCH * width
-    )
-    found = find_intersections(graph, lengths)
+    found = find_intersections(graph, _lengths(width))
     height, wide = mask.shape
     scene = prepare_scene(graph, found, (wide, height), mask.observed, mask.probability)
     return replace(scene, road_width_px=width), graph
+
+
+def _lengths(width: float) -> IntersectionOptions:
+    """Return how tangents are fitted to roads of a width, pixels."""
+    return IntersectionOptions(
+        tangent_length=_TANGENT * width, skip_length=_SKIP * width, min_branch_length=_BRANCH * width
+    )
 
 
 @dataclass(frozen=True)
@@ -254,6 +258,12 @@ class Query:
     scene: Scene
     graph: RoadGraph
     seconds: Seconds
+
+    def intersections_by(self, tangent_px: float) -> Intersections:
+        """Return the scene's intersections with tangents of the first pixels of their branches."""
+        lengths = replace(_lengths(self.scene.road_width_px), tangent_length=tangent_px, skip_length=0.0)
+        found = find_intersections(self.graph, lengths)
+        return found.only(np.flatnonzero(np.isin(found.node, self.scene.intersections.node)))
 
 
 def read_query(mask: RoadMask | AnyArray | str | Path) -> Query:

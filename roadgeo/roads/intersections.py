@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from roadgeo._arrays import AnyArray, Float32Array, FloatArray, IntArray
 from roadgeo.kernels import intersections as kernels
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["IntersectionOptions", "Intersections", "find_intersections", "unpack_branches"]
+__all__ = ["IntersectionOptions", "Intersections", "describe", "find_intersections", "unpack_branches"]
 
 #: Columns of `Intersections.rays` and `.tangents`: more branches than this at one place are kept as the first eight.
 MAX_BRANCHES = 8
@@ -131,13 +131,17 @@ def find_intersections(graph: RoadGraph, options: IntersectionOptions | None = N
     )
     node = np.flatnonzero(degree >= 3)
     starts = np.concatenate(([0], np.cumsum(degree[node]))).astype(np.int64)
-    n = len(node)
-    xy = np.empty((n, 2))
-    rays = np.full((n, MAX_BRANCHES), np.nan, np.float32)
-    tangents = np.full((n, MAX_BRANCHES), np.nan, np.float32)
-    residual = np.empty(n, np.float32)
+    found = describe(graph.xy[node], starts, lines, options)
+    return replace(found, node=node).only(np.flatnonzero(found.n_branches >= 3))
+
+
+def describe(near: FloatArray, starts: IntArray, lines: FloatArray, options: IntersectionOptions) -> Intersections:
+    """Describe intersections near (N, 2) points by their branches' lines; see `kernels.describe_intersections`."""
+    n = len(near)
+    xy, residual = np.empty((n, 2)), np.empty(n, np.float32)
+    rays, tangents = (np.full((n, MAX_BRANCHES), np.nan, np.float32) for _ in range(2))
     kernels.describe_intersections(
-        graph.xy[node],
+        near,
         starts,
         lines,
         np.radians(options.merge_angle_deg),
@@ -148,5 +152,4 @@ def find_intersections(graph: RoadGraph, options: IntersectionOptions | None = N
         tangents,
         residual,
     )
-    full = np.isfinite(rays).sum(axis=1) >= 3
-    return Intersections(xy[full], rays[full], tangents[full], residual[full], node[full])
+    return Intersections(xy, rays, tangents, residual, np.arange(n))

@@ -198,8 +198,11 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
         assert reported in capfd.readouterr().out
 
 
-def test_the_papers_matcher_says_once_what_it_found(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair"]) == 0
+@pytest.mark.parametrize("more", [[], ["--paper", "--pair", "orders=++", "--pair", "one_to_one=yes"]])
+def test_the_papers_matcher_says_once_what_it_found(
+    more: list[str], porto: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair", *more]) == 0
     out = capfd.readouterr().out
     assert re.search(r"located at 41\.152.* on porto: \d+ of \d+ intersections", out)
     assert out.count("located") == 1
@@ -258,6 +261,21 @@ def test_a_bad_mask_is_one_line_and_status_1(
 def test_the_papers_method_knows_no_hints(known: list[str], porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair", *known]) == 2
     assert f"--method pair takes no {known[0].partition('=')[0]}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--paper"], "--paper and --pair go with --method pair"),
+        (["--method", "pair", "--pair", "gamma=1"], "--pair 'gamma=1', expected NAME=VALUE, NAME one of d_max_m, "),
+        (["--method", "pair", "--pair", "delta=30"], "--pair 'delta=30', expected 1e-06 to 0.999999"),
+    ],
+)
+def test_the_papers_thresholds_are_its_own(
+    given: list[str], message: str, porto: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), *given]) == 2
+    assert message in " ".join(capfd.readouterr().err.split())
 
 
 def last_line(capfd: pytest.CaptureFixture[str]) -> str:

@@ -1,7 +1,8 @@
 """The paper's matcher: kernels against slow twins, counts against the paper's formulas, scenes with known H."""
 
 import math
-from dataclasses import replace
+import re
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,16 @@ from naive import paper as naive
 from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import paper
-from roadgeo.matching.pairs import PairIndex, build_pair_index, cross_ratios
-from roadgeo.matching.paper import PairOptions, fit_pencils, match_pairs, query_draws, reference_draws
+from roadgeo.matching.pairs import PairIndex, TupleOptions, build_pair_index, cross_ratios
+from roadgeo.matching.paper import (
+    PAPER,
+    PairOptions,
+    fit_pencils,
+    match_pairs,
+    query_draws,
+    read_options,
+    reference_draws,
+)
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 
 FRAME = np.array([[0, 0], [1000, 0], [1000, -1000], [0, -1000]], float)
@@ -90,7 +99,7 @@ def reference() -> Intersections:
 
 @pytest.fixture(scope="module")
 def index(reference) -> PairIndex:
-    return build_pair_index(reference)
+    return build_pair_index(reference, TupleOptions())
 
 
 def corner_error(match, homography) -> float:
@@ -144,13 +153,13 @@ def crossing(x, y, *tangents_deg):
     ],
 )
 def test_tuples_pass_equations_7_and_8(second, options, expected):
-    index = build_pair_index(intersections(*zip(crossing(0, 0, 0, 90), second, strict=True)), options.d_max_m)
+    index = build_pair_index(intersections(*zip(crossing(0, 0, 0, 90), second, strict=True)), options)
     assert len(index) == expected
 
 
 def test_types_put_the_lesser_end_first():
     found = intersections(*zip(crossing(0, 0, 0, 60, 120), crossing(100, 100, 0, 90), strict=True))
-    index = build_pair_index(found)
+    index = build_pair_index(found, TupleOptions())
     assert {key: item.pairs.tolist() for key, item in index.tuples.items()} == {
         (16 * 4 + 2) * 256 + 16 * 6 + 3: [[1, 0]]
     }
@@ -196,7 +205,7 @@ def test_candidates_are_those_within_the_relative_error(reference, index):
 def test_hardly_any_reference_is_no_place(n):
     few = intersections(*zip(*[crossing(0, 0, 0, 90)][:n], strict=True)) if n else intersections([], [], [])
     query = random_network(np.random.default_rng(3), n=40, side=900.0)
-    match = match_pairs(replace(query, xy=query.xy - [0, 950]), build_pair_index(few), FRAME)
+    match = match_pairs(replace(query, xy=query.xy - [0, 950]), build_pair_index(few, TupleOptions()), FRAME)
     assert match.homography is None
     assert match.n_samples == 0
     assert "no such place" in match.reason
@@ -239,7 +248,7 @@ def test_hypotheses_match_their_twin(reference, index, orders):
     """Tuples with two tangents at each end: the closed form is the direct linear transformation of all five lines."""
     rng = np.random.default_rng(4)
     query, _ = view(reference, camera(rng, (2000, 2000), 20), rng)
-    options = PairOptions(tangent_orders=orders, inlier_distance_m=60.0)
+    options = PairOptions(orders=orders, inlier_distance_m=60.0)
     search = searching(query, index, options, rng)
     codes = search.codes
     a, b = np.flatnonzero(codes == 16 * 3 + 2)[:2]
@@ -322,12 +331,12 @@ def test_noise_and_clutter_are_survived(reference, index, seed):
 @pytest.mark.parametrize("kind", ["mirrored", "horizon", "mirrored horizon"])
 def test_unphysical_orders_are_found_on_request_only(kind):
     network = random_network(np.random.default_rng(8), n=120, side=1400.0)
-    index = build_pair_index(network)
+    index = build_pair_index(network, TupleOptions())
     truth = np.diag([1.4, 1.4, 1.0]) @ np.array([[1, 0, 0], [0, 1, 1000], [0, 0, 1.0]])
     if "horizon" in kind:  # between the left third of the frame and the rest
         truth = np.array([[200.0, 0, 0], [0, 200, 100000], [1, 0, -300]])
         network = random_network(np.random.default_rng(8), n=600, side=1400.0)
-        index = build_pair_index(replace(network, xy=network.xy - 700))
+        index = build_pair_index(replace(network, xy=network.xy - 700), TupleOptions())
         network = replace(network, xy=network.xy - 700)
     if "mirrored" in kind:
         truth = truth @ np.array([[1, 0, 0], [0, -1, -1000], [0, 0, 1.0]])
@@ -335,7 +344,7 @@ def test_unphysical_orders_are_found_on_request_only(kind):
     options = PairOptions(time_limit_s=60, inlier_distance_m=2.0)
     match = match_pairs(query, index, FRAME, replace(options, p_query=0.2))
     assert match.homography is None
-    match = match_pairs(query, index, FRAME, replace(options, tangent_orders="all"))
+    match = match_pairs(query, index, FRAME, replace(options, orders="all"))
     assert match.homography is not None
     np.testing.assert_allclose(match.homography, truth / (truth[2] @ [500, -500, 1]), rtol=1e-5, atol=1e-5)
 
@@ -369,7 +378,7 @@ def test_elsewhere_is_no_such_place(reference, index):
 def test_sampled_subsets_claim_no_more_than_they_tested(reference, index):
     rng = np.random.default_rng(11)
     query, _ = view(random_network(rng), camera(rng, (2000, 2000), gsd=2.0), rng)
-    match = match_pairs(query, index, FRAME, PairOptions(p_query=0.3, lambda_1=0.6, tangent_orders="all"))
+    match = match_pairs(query, index, FRAME, PairOptions(p_query=0.3, lambda_1=0.6, orders="all"))
     assert match.hypotheses < 0.7 * match.candidates
     assert 1 - 0.01 <= match.confidence < 1 - 0.7**match.n_samples
 
@@ -422,7 +431,7 @@ def test_a_map_that_is_forged_to_fill_the_memory_is_refused():
     crowd = forged.only(np.arange(14_000) % 400)
     shifted = replace(crowd, xy=crowd.xy + np.random.default_rng(4).normal(0, 20, (14_000, 2)))
     with pytest.raises(IndexFormatError, match="the paper's method does not fit it"):
-        build_pair_index(shifted)
+        build_pair_index(shifted, TupleOptions())
 
 
 def test_query_shrunk_onto_a_few_places_is_no_match():
@@ -431,10 +440,28 @@ def test_query_shrunk_onto_a_few_places_is_no_match():
     spots = random_network(rng, n=12, side=60.0, gap_deg=40.0)
     query = random_network(rng, n=60, side=900.0, gap_deg=40.0)
     query = replace(query, xy=query.xy - [0, 950])
-    index = build_pair_index(spots)
-    options = PairOptions(inlier_distance_m=40.0, p_query=0.05, tangent_orders="++")
+    index = build_pair_index(spots, TupleOptions())
+    options = PairOptions(inlier_distance_m=40.0, p_query=0.05, orders="++")
     assert match_pairs(query, index, FRAME, options).homography is None
     assert match_pairs(query, index, FRAME, replace(options, one_to_one=False)).homography is not None
 
 
-# Real roads
+# Options
+
+
+def test_thresholds_are_read_by_the_papers_symbols():
+    given = ["delta=0.2", "lambda=0.05", "n_px=20", "orders=all", "one_to_one=no", "d_max_m=1500"]
+    expected = PairOptions(delta=0.2, lambda_=0.05, n_px=20, orders="all", one_to_one=False, d_max_m=1500.0)
+    assert read_options(given, PairOptions()) == expected
+    assert type(expected.n_px) is int
+
+
+def test_every_threshold_has_a_name():
+    names = {field.name.rstrip("_") for field in fields(PairOptions)} - {"work_limit_s", "time_limit_s"}
+    assert set(paper._ALLOWED) == names
+
+
+@pytest.mark.parametrize("wrong", ["delta", "delta=", "delta=nan", "delta=1", "n_px=1.5", "orders=+-", "gamma=1", ""])
+def test_what_is_no_threshold_is_refused(wrong):
+    with pytest.raises(ValueError, match=re.escape(repr(wrong)) + ", expected "):
+        read_options([wrong], PAPER)

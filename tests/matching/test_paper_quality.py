@@ -7,7 +7,8 @@ from worlds.scenes import PLANE
 
 from roadgeo.matching import pairs
 from roadgeo.matching.index import build_index
-from roadgeo.matching.pairs import well_fitted
+from roadgeo.matching.pairs import TupleOptions, paired
+from roadgeo.matching.paper import PairOptions
 from roadgeo.roads.network import build_network
 
 
@@ -20,8 +21,14 @@ def index():
     return build_index(build_network([*rows, *(LineString([(x, -50), (x, 1050)]) for x in at)], PLANE, {"name": "l"}))
 
 
-def test_bent_branches_are_discarded_and_straight_ones_kept(index):
-    good = well_fitted(index)
+def kept(index, **options):
+    found = pairs._fitted(index, TupleOptions(**options))
+    return np.isin(np.arange(len(index)), found.node)
+
+
+@pytest.mark.parametrize("from_center", [False, True])
+def test_bent_branches_are_discarded_and_straight_ones_kept(index, from_center):
+    good = kept(index, from_center=from_center)
     bent = np.abs(index.xy[:, 1] - 400.0) < 10.0
     assert bent.sum() >= 4
     assert not good[bent].any()
@@ -29,6 +36,17 @@ def test_bent_branches_are_discarded_and_straight_ones_kept(index):
     assert good[inside & ~bent].all()
 
 
-def test_branches_too_short_to_fit_are_discarded(index, monkeypatch):
-    monkeypatch.setattr(pairs, "_LENGTH_M", 3000.0)
-    assert not well_fitted(index).any()
+def test_branches_too_short_to_fit_are_discarded(index):
+    assert not kept(index, n_px=3000).any()
+
+
+def test_tangents_from_the_center_are_those_of_straight_roads(index):
+    found = pairs._fitted(index, TupleOptions(from_center=True))
+    np.testing.assert_allclose(found.xy, index.xy[found.node], atol=0.05)
+    off = np.degrees(found.tangents[:, :2].astype(float) - [0.0, np.pi / 2])
+    assert np.abs((off + 90) % 180 - 90).max() < 0.5
+
+
+def test_tables_are_kept_for_a_batch(index):
+    assert paired(index, TupleOptions()) is paired(index, PairOptions(delta=0.2).tuples)
+    assert paired(index, TupleOptions()) is not paired(index, PairOptions(d_max_m=500.0).tuples)
