@@ -62,7 +62,7 @@ ORDER = {
         "docs/faq",
     ],
     "Reference": ["docs/commands/README", "docs/api", "docs/glossary", "docs/faults", "SECURITY", "CHANGELOG"],
-    "Explanation": ["docs/how-it-works", "docs/how-well", "docs/architecture", "CONTRIBUTING"],
+    "Explanation": ["docs/how-it-works", "docs/how-well", "docs/paper", "docs/architecture", "CONTRIBUTING"],
 }
 COMMANDS = "index locate verify track apply serve vectorize library evaluate qgis demo completion"
 #: Pages that belong to another: its own list of links names them.

@@ -1,65 +1,108 @@
-"""Shared by the paper's experiments: its settings and figures, its search area, locators, and how results are shown.
+"""Shared by the paper's experiments: settings, search area, masks, methods, and how results are shown.
 
 Li, Yang, Wang, He, "Road-network-based Rapid Geolocalization" (arXiv 1906.12174), section 4.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import subprocess
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.scoring import Evaluation, evaluate
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
-from roadgeo.evaluation.trials import QuerySet, Trial, run_trials
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.evaluation.trials import DrawnMasks, MaskFiles, QuerySet, ReferenceLocator, Trial, run_trials
+from roadgeo.evaluation.truth import Truth, read_truth, write_truth
+from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.index import build_index
-from roadgeo.matching.pairs import PairIndex, build_pair_index
-from roadgeo.matching.paper import PairOptions, match_pairs
-from roadgeo.matching.scene import trace_query
-from roadgeo.reference.library import resolve_reference
+from roadgeo.matching.methods import search_references
+from roadgeo.matching.paper import PAPER
+from roadgeo.matching.scene import Query, prepare_scene, read_query
+from roadgeo.matching.verdict import decide
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.roads.intersections import Intersections, find_intersections
+from roadgeo.roads.intersections import find_intersections
 from roadgeo.roads.network import RoadNetwork, as_stored
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.workflows import LocateOptions, locate
 
-#: Section 4.3: "an area of 10 x 10 km2"; section 4.4: cross-ratio error 0.3, inlier ratio 0.5, 30 intersections.
+#: Section 4.3: "an area of 10 x 10 km2".
 AREA_M = 10_000.0
-PAIR = PairOptions(delta_cross_ratio=0.3, delta_inlier=0.5, min_intersections=30)
+#: The paper to the letter; what `--method pair` does; roadgeo's own.
+METHODS = {
+    "paper": LocateOptions(method="pair", pair=PAPER),
+    "pair": LocateOptions(method="pair"),
+    "auto": LocateOptions(),
+}
+COLORS = {"paper": "C3", "pair": "C1", "auto": "C0"}
 
 
-def arguments(description: str, queries: int = 100) -> argparse.ArgumentParser:
-    """Options that all experiments take."""
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("reference", help="a reference: REF.gpkg, or a name in the library")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder for the results (default: here)")
-    parser.add_argument("--queries", type=int, default=queries, help=f"masks per point (default {queries})")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--time-limit", type=float, default=10.0, help="seconds per mask (default 10)")
-    parser.add_argument("--methods", nargs="+", choices=["pair", "auto"], default=["pair", "auto"])
-    return parser
+@dataclass(frozen=True)
+class Setting:
+    """What all experiments share.
+
+    Attributes
+    ----------
+    reference, area : Path
+        `REF.gpkg` of the whole map, and of its square of 10 x 10 km with the most intersections.
+    dataset : Path
+        Folder of the Massachusetts Roads Dataset.
+    out, work : Path
+        Folders of the results, and of masks and maps, which are kept for another run.
+    queries, perspectives : int
+        Masks per point; random perspectives of each image of the dataset.
+    work_limit_s : float
+        Most work for a mask, in seconds of a usual machine: it is counted, so that results do not depend on the load.
+    """
+
+    reference: Path
+    area: Path
+    dataset: Path
+    out: Path
+    work: Path
+    queries: int
+    perspectives: int
+    seed: int
+    jobs: int
+    work_limit_s: float
+
+    def options(self, method: str, **pair: Any) -> LocateOptions:
+        """Return the options of a method; `pair` sets some of the paper's."""
+        options, limits = METHODS[method], {"work_limit_s": self.work_limit_s, "time_limit_s": 3600.0}
+        search = replace(options.search, **limits)
+        return replace(options, search=search, pair=replace(options.pair, **limits, **pair))
+
+    def locator(self, method: str, **pair: Any) -> ReferenceLocator:
+        """Return a method on the search area."""
+        return ReferenceLocator((self.area,), self.options(method, **pair))
+
+    def masks(self, scene_m: float, noise: str, least: int = 30) -> MaskFiles:
+        """Draw masks of scenes of a side under "random homography transformations", at 1 m per pixel, once."""
+        view = ViewOptions(
+            window_m=scene_m, tilt_deg=(0.0, 30.0), heading_deg=(0.0, 360.0), intersections=(least, 1_000_000)
+        )
+        name = f"{self.area.stem}-{scene_m:g}m-{noise}-{least}-{self.seed}"
+        drawn = SimulationOptions(view, NOISE_MODELS[noise], name, self.seed)
+        return keep_masks(DrawnMasks(self.area, ((drawn, self.queries),)), self.work / name)
 
 
-# --- the search area --------------------------------------------------------------------------------------------------
+# --- the search area and the masks ------------------------------------------------------------------------------------
 
 
-def search_area(reference: str, out: Path, side_m: float = AREA_M) -> Path:
+def cut_area(source: Path, work: Path, side_m: float = AREA_M) -> Path:
     """Cut the square of this side with the most intersections out of a reference, as a reference of its own."""
-    source = resolve_reference(reference)
-    target = out / f"{source.stem}-{side_m / 1000:g}km.gpkg"
+    target = work / f"{source.stem}-{side_m / 1000:g}km.gpkg"
     if not target.is_file():
-        out.mkdir(parents=True, exist_ok=True)
         network = as_stored(cut_network(read_network(source), side_m))
         Reference(build_index(network), network).save(target)
     return target
@@ -69,7 +112,8 @@ def cut_network(network: RoadNetwork, side_m: float, step_m: float = 500.0) -> R
     """Keep the edges that lie in the densest square of a network."""
     xy = network.intersections.xy
     low = xy.min(axis=0)
-    corners = [low + np.array([i, j]) * step_m for i, j in np.ndindex(*_steps(xy, side_m, step_m))]
+    spans = np.maximum((np.ptp(xy, axis=0) - side_m) // step_m, 0).astype(int) + 1
+    corners = [low + np.array([i, j]) * step_m for i, j in np.ndindex(*spans)]
     corner = max(corners, key=lambda at: int(((xy >= at) & (xy <= at + side_m)).all(axis=1).sum()))
     graph = network.graph
     inside = ((graph.coords >= corner) & (graph.coords <= corner + side_m)).all(axis=1)
@@ -80,132 +124,96 @@ def cut_network(network: RoadNetwork, side_m: float, step_m: float = 500.0) -> R
     return RoadNetwork(part, find_intersections(part), network.plane, (square,), network.meta)
 
 
-def _steps(xy: np.ndarray, side_m: float, step_m: float) -> tuple[int, int]:
-    spans = np.ptp(xy, axis=0) - side_m
-    columns, rows = (max(int(span // step_m), 0) + 1 for span in spans)
-    return columns, rows
+def keep_masks(queries: QuerySet, folder: Path) -> MaskFiles:
+    """Write the masks of a query set to a folder; if they are there already, nothing is drawn again."""
+    if not (folder / "truth.csv").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        draw = queries.open()
+        write_truth(folder, [_keep_mask(*draw(k), folder / str(k)) for k in range(len(queries))])
+    return MaskFiles(folder, tuple(read_truth(folder / "truth.csv")))
 
 
-# --- queries and locators ---------------------------------------------------------------------------------------------
+def _keep_mask(truth: Truth, mask: Any, path: Path) -> Truth:
+    """Write a mask, or a map of probabilities."""
+    if isinstance(mask, ProbabilityMap):
+        path = path.with_suffix(".tif")
+        mask.write(path)
+    else:
+        path = path.with_suffix(".png")
+        cv2.imwrite(str(path), mask)
+    return replace(truth, file=path.name)
 
 
-def views(scene_m: float, least: int = 30) -> ViewOptions:
-    """Views of a scene of side d_r under "random homography transformations", at 1 m per pixel."""
-    return ViewOptions(
-        window_m=scene_m, tilt_deg=(0.0, 30.0), heading_deg=(0.0, 360.0), intersections=(least, 1_000_000)
-    )
-
-
-def masks(scene_m: float, noise: str, seed: int, least: int = 30) -> SimulationOptions:
-    """Masks of such views."""
-    return SimulationOptions(views(scene_m, least), NOISE_MODELS[noise], f"{scene_m:g} m, {noise}", seed)
-
-
-@dataclass(frozen=True)
-class PairLocator:
-    """The paper's matcher, on a random subset of N_r of the mask's intersections where `n_r` is given."""
-
-    reference: Path
-    options: PairOptions = PAIR
-    n_r: int | None = None
-
-    def open(self) -> Callable[[Any], dict[str, Any]]:
-        """Build the paper's tables."""
-        network = read_network(self.reference)
-        table = build_pair_index(network.intersections, self.options.d_max_m)
-        return lambda mask: self._locate(mask, network, table)
-
-    def _locate(self, mask: Any, network: RoadNetwork, table: PairIndex) -> dict[str, Any]:
-        from time import perf_counter
-
-        started = perf_counter()
-        scene, _ = trace_query(as_mask(mask))
-        traced = perf_counter()
-        query, options = scene.intersections, self.options
-        if self.n_r is not None:
-            query, options = subset(query, self.n_r), replace(options, min_intersections=min(self.n_r, len(query)))
-        match = match_pairs(query, table, scene.corners, options)
-        answer = {
-            "status": "not_located" if match.homography is None else "located",
-            "reason": match.reason,
-            "crs": network.plane.crs,
-            "size": list(scene.size),
-            "n_intersections": len(query),
-            "inlier_ratio": match.inlier_ratio,
-            "seconds": {"vectorize": traced - started, "match": match.seconds},
-            "stats": {"tuples_sampled": match.n_samples, "hypotheses": match.hypotheses},
-        }
-        if match.homography is not None:
-            matrix = network.plane.to_crs_matrix() @ match.homography @ PIXEL_TO_PLANE
-            answer["homography"] = (matrix / matrix[2, 2]).tolist()
-        return answer
+# --- fewer intersections ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class AutoLocator:
-    """roadgeo's default, on the middle of the mask that holds N_r of its intersections where `n_r` is given.
+class FewLocator:
+    """A method on N_r of a mask's intersections.
 
-    It goes by the roads too, so a subset of the intersections would leave it most of its knowledge.
+    The paper's gets some at random (section 4.3). roadgeo's own goes by the roads too, and would keep most of its
+    knowledge: it gets the middle of the mask that holds as many.
     """
 
     reference: Path
-    options: LocateOptions = field(default_factory=LocateOptions)
-    n_r: int | None = None
+    options: LocateOptions
+    n_r: int
 
     def open(self) -> Callable[[Any], dict[str, Any]]:
         """Open the reference."""
         reference = open_reference(self.reference)
+        least = replace(self.options.pair, min_intersections=self.n_r)
+        options = replace(self.options, pair=least)
 
         def answer(mask: Any) -> dict[str, Any]:
-            shown = as_mask(mask)
-            return locate(middle(shown, self.n_r) if self.n_r else shown, reference, self.options).to_dict()
+            query = read_query(mask)
+            if options.method == "auto":
+                return locate(middle(query, mask, self.n_r), reference, options).to_dict()
+            query = subset(query, self.n_r)
+            searched = search_references(query, reference.parts, options, options.pair.time_limit_s)
+            return decide(query, searched, options).to_dict()
 
         return answer
 
 
-def as_mask(mask: Any) -> RoadMask:
-    """Take a drawn mask, or the file of one, as `roadgeo.locate` does: the void corners of a warped one are known."""
+def subset(query: Query, n_r: int) -> Query:
+    """Keep N_r intersections at random, always the same of the same mask."""
+    found = query.scene.intersections
+    rng = np.random.default_rng(zlib.crc32(found.xy.tobytes()))
+    kept = found.only(np.sort(rng.permutation(len(found))[:n_r]))
+    return replace(query, scene=prepare_scene(query.graph, kept, query.scene.size))
+
+
+def middle(query: Query, path: Any, n_r: int) -> RoadMask:
+    """Keep the smallest square around the middle of a mask that shows N_r intersections; the rest was not observed."""
     from roadgeo.sources.masks import read_mask
 
-    return read_mask(mask)
-
-
-def subset(found: Intersections, n_r: int) -> Intersections:
-    """Choose N_r intersections at random, always the same for the same mask (section 4.3)."""
-    rng = np.random.default_rng(zlib.crc32(found.xy.tobytes()))
-    kept = np.sort(rng.permutation(len(found))[:n_r])
-    return Intersections(found.xy[kept], found.rays[kept], found.tangents[kept], found.residual[kept], found.node[kept])
-
-
-def middle(mask: RoadMask, n_r: int) -> RoadMask:
-    """Keep the smallest square around the middle that shows N_r intersections; the rest was not observed."""
-    scene, _ = trace_query(mask)
-    height, width = mask.shape
+    mask, (width, height) = read_mask(path), query.scene.size
     rows, columns = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (height, width))
-    away = np.abs(scene.intersections.xy * (1, -1) - (width / 2, height / 2)).max(axis=1)
+    away = np.abs(query.scene.intersections.xy * (1, -1) - (width / 2, height / 2)).max(axis=1)
     # Those near its border lose a branch, so a square around N_r of them does not show as many.
     for half in np.sort(away)[n_r :: max(n_r // 5, 1)]:
         observed = (rows[:, None] < half) & (columns[None, :] < half)
         part = RoadMask(mask.roads & observed, observed, mask.name)
-        if len(trace_query(part)[0].intersections) >= n_r:
+        if len(read_query(part).scene.intersections) >= n_r:
             return part
     return mask
 
 
-def trials(queries: QuerySet, locator: Any, options: argparse.Namespace, what: str) -> tuple[list[Trial], Evaluation]:
+# --- results ----------------------------------------------------------------------------------------------------------
+
+
+def trials(queries: QuerySet, locator: Any, jobs: int, what: str) -> tuple[list[Trial], Evaluation]:
     """Run one point of an experiment and report it."""
-    done = run_trials(queries, locator, options.jobs)
+    done = run_trials(queries, locator, jobs)
     found = evaluate([trial.truth for trial in done], [trial.answer for trial in done])
     total = found.total
     print(
         f"{what}: precision {percent(total.precision.value)}, recall {percent(total.recall.value)} "
-        f"({total.recall.hits} of {total.recall.of}), median {1000 * total.compute_s.median:.0f} ms",
+        f"({total.recall.hits} of {total.recall.of})",
         flush=True,
     )
     return done, found
-
-
-# --- results ----------------------------------------------------------------------------------------------------------
 
 
 def percent(value: float) -> str:
@@ -216,13 +224,16 @@ def percent(value: float) -> str:
 def point(found: Evaluation) -> dict[str, Any]:
     """The figures of an evaluation, as plain values."""
     plain = found.to_dict()["total"]
-    return {name: plain[name] for name in ("queries", "located", "precision", "recall", "center_m", "compute_s")}
+    return {name: plain[name] for name in ("queries", "located", "precision", "recall", "center_m")}
 
 
-def save(out: Path, name: str, results: dict[str, Any]) -> None:
-    """Write results as JSON."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
+def save(setting: Setting, name: str, results: dict[str, Any]) -> None:
+    """Write results as JSON, with what they were made of."""
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    about = {name: getattr(setting, name) for name in ("queries", "perspectives", "seed", "work_limit_s")}
+    about |= {"commit": commit, "reference": setting.area.stem}
+    (setting.out / f"{name}.json").write_text(json.dumps(about | results, indent=1) + "\n")
 
 
 def axes(rows: int = 1, columns: int = 2, **options: Any) -> Any:
@@ -235,7 +246,7 @@ def axes(rows: int = 1, columns: int = 2, **options: Any) -> Any:
     return plt.subplots(rows, columns, figsize=(5.2 * columns, 3.9 * rows), layout="constrained", **options)
 
 
-def plot_share(ax: Any, xs: Sequence[float], shares: Sequence[dict[str, Any]], label: str, **style: Any) -> None:
+def plot_share(ax: Any, xs: Sequence[float], shares: Iterable[dict[str, Any]], label: str, **style: Any) -> None:
     """Draw shares with their intervals over something."""
     known = [(x, s) for x, s in zip(xs, shares, strict=True) if s["of"]]
     if not known:

@@ -1,59 +1,42 @@
 """Figure 7: how many tuples of two intersections there are of each type; and whether to draw the rarest first pays.
 
-    python examples/paper/figure7.py boston-ma --out results
-
 A type is d_b = [N_B(P1), N_B(P2), N_q(P1), N_q(P2)]: branches and tangents of both ends.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import experiments as paper
 import numpy as np
 
-from roadgeo.evaluation.trials import DrawnMasks
-from roadgeo.matching.pairs import build_pair_index
+from roadgeo.matching.pairs import TupleOptions, paired
+from roadgeo.reference.opening import open_reference
 
 
-def main() -> None:
+def run(setting: paper.Setting) -> None:
     """Run the experiment."""
-    parser = paper.arguments(__doc__, queries=50)
-    options = parser.parse_args()
-    area = paper.search_area(options.reference, options.out)
-    table = build_pair_index(paper.read_network(area).intersections)
-    keys = list(table.tuples)
-    counts = np.array([len(item.pairs) for item in table.tuples.values()])
-    order = np.argsort(-counts)
-    shares = np.cumsum(counts[order]) / counts.sum()
-    print(f"{len(table):,} tuples of {len(counts)} types; the commonest:")
-    for t in order[:8]:
-        print(f"  {_type(keys[t])}  {counts[t]:>9,}  {100 * counts[t] / counts.sum():.1f} %")
-    print(
-        f"{np.searchsorted(shares, 0.9) + 1} types hold 90 % of them; {np.sum(counts < 100)} types have fewer than 100"
-    )
-
+    (part,) = open_reference(setting.area).parts
+    table = paired(part.open(), TupleOptions())
+    types = sorted(((len(of_type.pairs), _type(key)) for key, of_type in table.tuples.items()), reverse=True)
+    counts = np.array([count for count, _ in types])
+    shares = np.cumsum(counts) / counts.sum()
+    print(f"{len(table):,} tuples of {len(counts)} types; the two commonest hold {100 * shares[1]:.0f} %")
+    print(f"{np.searchsorted(shares, 0.9) + 1} hold 90 %; {np.sum(counts < 100)} have fewer than 100 tuples")
     results = []
-    for noise in ("clean", "segmented", "poor"):
-        queries = DrawnMasks(area, ((paper.masks(1500.0, noise, options.seed), options.queries),))
+    for noise in ("clean", "segmented"):
+        queries = setting.masks(1500.0, noise)
         for rarest in (True, False):
-            pair = replace(paper.PAIR, rarest_first=rarest, time_limit_s=options.time_limit)
+            locator = setting.locator("pair", rarest_first=rarest)
             name = f"{noise}, {'rarest type first' if rarest else 'any type'}"
-            done, found = paper.trials(queries, paper.PairLocator(area, pair), options, name)
+            done, found = paper.trials(queries, locator, setting.jobs, name)
             tested = [t.answer["stats"]["hypotheses"] for t in done if t.answer["status"] == "located"]
-            results.append(
-                {
-                    "noise": noise,
-                    "rarest_first": rarest,
-                    "median_hypotheses_of_located": float(np.median(tested)) if tested else None,
-                    **paper.point(found),
-                }
-            )
-    types = [{"type": _type(keys[t]), "tuples": int(counts[t])} for t in order]
-    paper.save(options.out, "figure7", {"reference": area.stem, "types": types, "rarest_first": results})
-
-    draw(area.stem, counts[order], results, options.out)
+            median = float(np.median(tested)) if tested else None
+            about = {"noise": noise, "rarest_first": rarest, "median_hypotheses_of_located": median}
+            results.append({**about, **paper.point(found)})
+    listed = [{"type": of_type, "tuples": count} for count, of_type in types]
+    paper.save(setting, "figure7", {"types": listed, "rarest_first": results})
+    draw(setting, counts, results)
 
 
 def _type(key: int) -> list[int]:
@@ -62,11 +45,12 @@ def _type(key: int) -> list[int]:
     return [first // 16, second // 16, first % 16, second % 16]
 
 
-def draw(area: str, counts: np.ndarray, results: list[dict[str, Any]], out: paper.Path) -> None:
+def draw(setting: paper.Setting, counts: np.ndarray, results: list[dict[str, Any]]) -> None:
     """Plot how many tuples each type has, commonest first, and recall in either order of drawing."""
     figure, (bars, orders) = paper.axes()
     bars.bar(np.arange(len(counts)), counts, width=1.0)
-    bars.set(yscale="log", xlabel="types, by frequency", ylabel="tuples", title=f"{area}: {counts.sum():,} tuples")
+    title = f"{setting.area.stem}: {counts.sum():,} tuples"
+    bars.set(yscale="log", xlabel="types, by frequency", ylabel="tuples", title=title)
     for rarest, shift in ((True, -0.2), (False, 0.2)):
         chosen = [r["recall"] for r in results if r["rarest_first"] is rarest]
         value, low, high = (np.array([share[name] for share in chosen]) for name in ("value", "low", "high"))
@@ -76,8 +60,4 @@ def draw(area: str, counts: np.ndarray, results: list[dict[str, Any]], out: pape
     kinds = list(dict.fromkeys(r["noise"] for r in results))
     orders.set(xticks=np.arange(len(kinds)), xticklabels=kinds, ylim=(0, 1.03), ylabel="recall of pair")
     orders.legend()
-    figure.savefig(out / "figure7.png", dpi=110)
-
-
-if __name__ == "__main__":
-    main()
+    figure.savefig(setting.out / "figure7.png", dpi=110)

@@ -28,36 +28,42 @@ def town(tmp_path_factory):
     return path
 
 
-def run(script, town, out, *arguments):
-    command = [
-        sys.executable,
-        str(PAPER / script),
-        str(town),
-        "--out",
-        str(out),
-        "--queries",
-        "1",
-        "--time-limit",
-        "0.5",
-    ]
+def run(*arguments):
+    command = [sys.executable, str(PAPER / "run.py"), *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(PAPER.parent.parent)}
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, env=environment, check=False)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.mark.parametrize("name", ["figure5", "figure6", "figure7", "figure8"])
+def test_an_experiment_runs(name, town, tmp_path):
+    done = run(town, "-o", tmp_path, "--queries", 1, "--work-limit", 0.2, "--only", name)
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert "precision" in done.stdout
+    assert json.loads((tmp_path / f"{name}.json").read_text())["queries"] == 1
+    assert (tmp_path / f"{name}.png").is_file()
 
 
-@pytest.mark.parametrize(
-    ("script", "arguments", "result"),
-    [
-        ("figure5.py", ["--n-r", "20", "--methods", "pair"], "figure5"),
-        ("figure6.py", ["--methods", "auto"], "figure6"),
-        ("figure7.py", [], "figure7"),
-        ("figure8.py", [], "figure8"),
-        ("tables.py", [], "table2"),
-    ],
-)
-def test_an_experiment_runs(script, arguments, result, town, tmp_path):
-    printed = run(script, town, tmp_path, *arguments)
-    assert "precision" in printed
-    assert json.loads((tmp_path / f"{result}.json").read_text())
-    assert (tmp_path / f"{result}.png").is_file() or result.startswith("table")
+def test_the_tables_are_made_of_all_tiles(town, data_dir, tmp_path):
+    """One tile of each kind."""
+    dataset = tmp_path / "dataset"
+    for name in ("tiles.csv", "segmentation/tiles.csv"):
+        (dataset / name).parent.mkdir(parents=True, exist_ok=True)
+        head, first, *_ = (data_dir / "massachusetts" / name).read_text().splitlines()
+        (dataset / name).write_text(f"{head}\n{first}\n")
+    for name in ("masks", "segmentation/images", "roads_from_labels.parquet"):
+        (dataset / name).symlink_to(data_dir / "massachusetts" / name)
+    more = ("--work-limit", 0.2, "--perspectives", 1, "--only", "tables")
+    done = run(town, "--dataset", dataset, "-o", tmp_path, *more)
+    assert done.returncode == 0, done.stderr
+    assert {(row["method"], row["of"]) for row in json.loads((tmp_path / "table3.json").read_text())["rows"]} == {
+        (method, of) for method in ("paper", "pair", "auto") for of in ("labels", "photographs")
+    }
+    assert "## Table 3" in (tmp_path / "tables.md").read_text()
+
+
+def test_what_is_missing_is_said_first(tmp_path):
+    done = run("nowhere", "--dataset", tmp_path / "none", "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert "no reference 'nowhere'" in done.stderr
+    assert "tiles.csv, of the Massachusetts Roads Dataset" in done.stderr
+    assert not (tmp_path / "out").exists()
