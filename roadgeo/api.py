@@ -254,23 +254,23 @@ def locate(
         sighting = sighting.answering(take_place(sighting.location, take, options))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
     origin = {"options": changed, "reference_digest": digest_of(references, sighting.location.reference)}
-    found = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
+    answer = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
     indexes = tuple(item.index_of(sighting.location) for item in references)
     picture = picture if sighting.of_photograph else None
     photo, pixels = (picture, None) if isinstance(picture, str) else (None, picture)
-    return Answer(**{**found, **origin}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
+    return Answer(**{**answer, **origin}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
 
 
 def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
     """Put what is known where the search looks for it."""
-    known = dict(read_hint(name, value) for name, value in given.items() if value is not None)
-    if known.get("focal_px") == "exif":
+    hints = dict(read_hint(name, value) for name, value in given.items() if value is not None)
+    if hints.get("focal_px") == "exif":
         from roadgeo.sources.exif import focal_in_pixels
 
         if not isinstance(image, str | os.PathLike):
             raise ValueError('focal="exif" is for files; give the focal length in pixels')
-        known["focal_px"] = focal_in_pixels(os.fspath(image))
-    return apply_hints(options, known)
+        hints["focal_px"] = focal_in_pixels(os.fspath(image))
+    return apply_hints(options, hints)
 
 
 def verify(
@@ -417,10 +417,10 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
     from roadgeo.running.pictures import read_picture
     from roadgeo.running.queries import read_roads
 
-    seen = read_roads(read_picture(image), _hint("gsd", gsd), ReadOptions())
-    _, graph = trace_query(seen.mask)
+    roads = read_roads(read_picture(image), _hint("gsd", gsd), ReadOptions())
+    _, graph = trace_query(roads.mask)
     return graph.to_networkx(
-        lambda xy: seen.coarser * plane_to_pixel(xy),
+        lambda xy: roads.coarser * plane_to_pixel(xy),
         name=os.fspath(image) if isinstance(image, str | os.PathLike) else "array",
     )
 

@@ -84,8 +84,8 @@ def locate(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    query, found, options = _search(mask, reference, options)
-    return decide(query, found, options)
+    query, results, options = _search(mask, reference, options)
+    return decide(query, results, options)
 
 
 def explain(
@@ -105,9 +105,9 @@ def explain(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    query, found, options = _search(mask, reference, options, explained=True)
-    stories = tuple(tell(query, one, options) for one in found)
-    return Explanation(decide(query, found, options), query.scene, query.graph, stories)
+    query, results, options = _search(mask, reference, options, explained=True)
+    stories = tuple(tell(query, one, options) for one in results)
+    return Explanation(decide(query, results, options), query.scene, query.graph, stories)
 
 
 def _search(

@@ -103,19 +103,22 @@ def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
     from roadgeo.evaluation.scoring import score
     from roadgeo.evaluation.truth import Truth
 
-    found = outcome.document
+    answer = outcome.document
     if outcome.status == "error":
-        return False, str(found["reason"])
+        return False, str(answer["reason"])
     if outcome.status != "located":
         right = not mask.in_map
-        return right, f"{'refused, as it should be' if right else 'not found, although it is there'}: {found['reason']}"
+        return (
+            right,
+            f"{'refused, as it should be' if right else 'not found, although it is there'}: {answer['reason']}",
+        )
     if not mask.in_map:
-        return False, f"located, although it is not on this map: {found['reason']}"
-    truth = Truth(mask.path.name, "mask", mask.homography, mask.crs, tuple(found["size"]))
-    scored = score(truth, found)
-    where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
-    seconds = found["seconds"]
+        return False, f"located, although it is not on this map: {answer['reason']}"
+    truth = Truth(mask.path.name, "mask", mask.homography, mask.crs, tuple(answer["size"]))
+    scored = score(truth, answer)
+    where = format_lonlat(answer["center"]["lon"], answer["center"]["lat"])
+    seconds = answer["seconds"]
     return scored.center_m < mask.known_to_m, (
         f"found at {where}: the middle is {scored.center_m:.1f} m off, the corners {scored.corners_rms_m:.1f} m; "
-        f"{found['n_matched']} intersections matched, {seconds['total'] - seconds['open'] - seconds['write']:.2f} s"
+        f"{answer['n_matched']} intersections matched, {seconds['total'] - seconds['open'] - seconds['write']:.2f} s"
     )

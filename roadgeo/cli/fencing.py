@@ -103,15 +103,15 @@ def _named(given: Mapping[str, Any]) -> list[str]:
     """Return all files and folders that values name; behind a colon, too, as of `--source files:roads.geojson`."""
     texts = [text for name, value in given.items() if name not in _RESULTS for text in _texts(value)]
     texts += [text.partition(":")[2] for text in texts if ":" in text]
-    found = []
+    paths = []
     for text in texts:
         if os.path.lexists(text):
-            found.append(text)
+            paths.append(text)
         elif glob.has_magic(text):
-            found += glob.glob(text, recursive=True)  # noqa: PTH207 - as `running.tasks` reads it
+            paths += glob.glob(text, recursive=True)  # noqa: PTH207 - as `running.tasks` reads it
     if (table := given.get("queries")) is not None and not table.is_dir():
-        found.append(os.fspath(table.parent))  # its masks lie beside it
-    return found
+        paths.append(os.fspath(table.parent))  # its masks lie beside it
+    return paths
 
 
 def _texts(value: Any) -> Iterator[str]:

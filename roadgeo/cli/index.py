@@ -164,12 +164,12 @@ def _keep_or_replace(path: Path) -> None:
     if not path.exists():
         return
     try:
-        known = counted(describe_reference(path).get("counts", {}).get("intersections", 0), "intersection")
+        size = counted(describe_reference(path).get("counts", {}).get("intersections", 0), "intersection")
     except IndexFormatError:  # it is damaged: nothing is lost
         return
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise OutputError(f"{path}: is a reference of {known}; replace it with --replace, or choose another name")
-    click.confirm(f"There is a reference {path.stem} of {known}. Replace it?", abort=True, err=True)
+        raise OutputError(f"{path}: is a reference of {size}; replace it with --replace, or choose another name")
+    click.confirm(f"There is a reference {path.stem} of {size}. Replace it?", abort=True, err=True)
 
 
 def _rebuild(name: str) -> None:
@@ -196,9 +196,9 @@ def _one_source(source: dict[str, Any]) -> str:
     if source["bbox"] and given != ["roads"]:
         given.append("bbox")
     if len(given) != 1:
-        known = ", ".join(_FETCHED.values())
+        flags = ", ".join(_FETCHED.values())
         raise click.UsageError(
-            f"Give one source of roads: {known}, --bbox W,S,E,N, --roads FILE or --source NAME:WHERE."
+            f"Give one source of roads: {flags}, --bbox W,S,E,N, --roads FILE or --source NAME:WHERE."
         )
     if given in (["roads"], ["plugin"]) and (source["date"] or source["no_cache"]):
         raise click.UsageError("--date and --no-cache go with roads that are fetched from OpenStreetMap.")

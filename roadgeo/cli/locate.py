@@ -260,12 +260,12 @@ def _photograph_of(mask: str, pictures: Sequence[Path], folder: str) -> str:
     stem = Path(mask).stem
     others = [path for path in pictures if path.resolve() != Path(mask).resolve()]
     for name in dict.fromkeys((stem.removesuffix("_mask"), stem)):
-        found = [path for path in others if path.stem == name]
-        if len(found) > 1:
-            chosen, other = (visible(str(path)) for path in found[:2])
+        named = [path for path in others if path.stem == name]
+        if len(named) > 1:
+            chosen, other = (visible(str(path)) for path in named[:2])
             _LOG.warning("%s: %s is drawn, though %s has its name, too", visible(mask), chosen, other)
-        if found:
-            return str(found[0])
+        if named:
+            return str(named[0])
     raise click.UsageError(f"No photograph in {folder} has the name of {mask}.")
 
 
@@ -274,22 +274,22 @@ def _photograph_of(mask: str, pictures: Sequence[Path], folder: str) -> str:
 
 def describe(outcome: Outcome) -> str:
     """Print the result of a mask, in a line or two."""
-    found = outcome.document
+    answer = outcome.document
     words = outcome.status.replace("_", " ")
-    query = visible(found["query"])
+    query = visible(answer["query"])
     if outcome.earlier:
         return f"{query}: {words} before"
     status = paint(words, "green" if outcome.status == "located" else "yellow")
-    if outcome.status not in ("located", "chosen") or found["center"] is None:
-        text = f"{query}: {status}: {visible(found['reason'])}"
+    if outcome.status not in ("located", "chosen") or answer["center"] is None:
+        text = f"{query}: {status}: {visible(answer['reason'])}"
     else:
-        where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
-        text = f"{query}: {status} at {where} on {visible(found['reference'])}: {visible(found['reason'])}"
-    if found.get("part_read"):
-        text += f"\n  read {visible(found['part_read'])}"
-    if found.get("stated_offset_m") is not None:
-        text += f"\n  its own georeference, or EXIF, puts the middle {found['stated_offset_m']:,.1f} m from there"
-    if outcome.photo and outcome.photo[0] != found["query"]:
+        where = format_lonlat(answer["center"]["lon"], answer["center"]["lat"])
+        text = f"{query}: {status} at {where} on {visible(answer['reference'])}: {visible(answer['reason'])}"
+    if answer.get("part_read"):
+        text += f"\n  read {visible(answer['part_read'])}"
+    if answer.get("stated_offset_m") is not None:
+        text += f"\n  its own georeference, or EXIF, puts the middle {answer['stated_offset_m']:,.1f} m from there"
+    if outcome.photo and outcome.photo[0] != answer["query"]:
         text += f"\n  drew {visible(outcome.photo[0])}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:
         text += f"\n  removed what an earlier run had found: {visible(', '.join(outcome.removed))}"

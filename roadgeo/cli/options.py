@@ -297,9 +297,9 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
                 self.fail(f"no such model file: {text}", param, ctx)
             return text
         name, colon, _ = text.partition(":")
-        known = self.names()
-        if name not in known or bool(colon) != self.has_argument:
-            expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in known)
+        installed = self.names()
+        if name not in installed or bool(colon) != self.has_argument:
+            expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in installed)
             self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
         return text
 
@@ -448,7 +448,7 @@ def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_options(
-    known: Mapping[str, Any], method: Any = "auto", *, paper: bool = False, pair: Sequence[str] = ()
+    hints: Mapping[str, Any], method: Any = "auto", *, paper: bool = False, pair: Sequence[str] = ()
 ) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is.
 
@@ -463,7 +463,7 @@ def make_options(
     from roadgeo.workflows import LocateOptions
 
     if method == "pair":
-        idle = [hint for hint in HINTS.values() if hint.group != SEARCH and known.get(hint.goes_to, False) is not False]
+        idle = [hint for hint in HINTS.values() if hint.group != SEARCH and hints.get(hint.goes_to, False) is not False]
         if idle:
             raise click.UsageError(f"--method pair takes no {', '.join(hint.option for hint in idle)}: leave it out.")
     elif paper or pair:
@@ -472,7 +472,7 @@ def make_options(
         thresholds = read_options(pair, PAPER if paper else PairOptions())
     except ValueError as error:
         raise click.UsageError(f"--pair {error}.") from error
-    return apply_hints(replace(LocateOptions(), method=method, pair=thresholds), known)
+    return apply_hints(replace(LocateOptions(), method=method, pair=thresholds), hints)
 
 
 def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None) -> list[Task]:
@@ -486,10 +486,10 @@ def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | N
     from roadgeo.running.tasks import find_masks, name_tasks
     from roadgeo.storage.rasters import name_page
 
-    found = [name_page(name, given.get("page")) for name in find_masks(images, given["recursive"])]
-    if not found:
+    paths = [name_page(name, given.get("page")) for name in find_masks(images, given["recursive"])]
+    if not paths:
         raise click.UsageError(f"No images in {', '.join(images)}.")
-    return name_tasks(found, out_dir)
+    return name_tasks(paths, out_dir)
 
 
 def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = None) -> list[AnyReference]:
@@ -526,8 +526,8 @@ def read_options(given: Mapping[str, Any], jobs: int = 1) -> ReadOptions:
 
     from roadgeo.running.options import ReadOptions
 
-    known = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) not in (None, ())}
-    return ReadOptions(**{**known, "threads": n_threads(jobs)})
+    stated = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) not in (None, ())}
+    return ReadOptions(**{**stated, "threads": n_threads(jobs)})
 
 
 def make_cluster(given: Mapping[str, Any], jobs: int) -> Cluster | None:

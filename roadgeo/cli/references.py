@@ -68,10 +68,10 @@ def list_plugins() -> None:
     """Print the plugins that are installed: group, name, package, object."""
     from roadgeo.plugins import GROUPS, find_plugins
 
-    found = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
+    installed = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
     lines = [
         (plugin.group, plugin.name, f"{plugin.dist.name} {plugin.dist.version}" if plugin.dist else "", plugin.value)
-        for plugin in found
+        for plugin in installed
     ]
     if is_set("as_json"):
         echo(json.dumps([dict(zip(("group", "name", "package", "object"), line, strict=True)) for line in lines]))
@@ -200,14 +200,14 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _kinds_text(kinds: str, sources: Any) -> str:
     """Return which kinds were taken, and of which sources all lines, because they have no kinds of roads."""
-    known = [source for source in sources if isinstance(source, dict) and "kinds_known" in source]
-    unknown = [visible(str(source.get("name"))) for source in known if source["kinds_known"] is False]
+    stating = [source for source in sources if isinstance(source, dict) and "kinds_known" in source]
+    unknown = [visible(str(source.get("name"))) for source in stating if source["kinds_known"] is False]
     if not unknown:
         return kinds
     names = ", ".join(unknown)
     return (
         f"not known, all lines of {names} were taken"
-        if len(unknown) == len(known)
+        if len(unknown) == len(stating)
         else f"{kinds}; of {names} all lines"
     )
 

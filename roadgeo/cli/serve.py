@@ -199,11 +199,11 @@ def _log() -> None:
         logging.getLogger("uvicorn.access").setLevel(logging.INFO)
 
 
-def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
+def _tell(sender: MavlinkSender, document: dict[str, Any], came_s: float) -> None:
     """Send the place of a mask that was located; it was taken when its request came."""
     from roadgeo.flights.mavlink import fix_of
 
-    fix = fix_of(found, came_s)
+    fix = fix_of(document, came_s)
     if fix is not None:
         sender.send(fix)
 

@@ -78,7 +78,7 @@ def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: 
     tell_built(f"{path}: {n:,} intersections in {len(entries)} shards", started, out or path.stem)
 
 
-def tell_built(found: str, started: float, reference: str) -> None:
+def tell_built(built: str, started: float, reference: str) -> None:
     """Print what was built, since a moment of `perf_counter`, and how it is searched."""
     seconds = perf_counter() - started
-    tell(f"{found} in {seconds:.1f} s; search it with `roadgeo locate photo.jpg -r {reference}`")
+    tell(f"{built} in {seconds:.1f} s; search it with `roadgeo locate photo.jpg -r {reference}`")

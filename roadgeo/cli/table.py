@@ -25,10 +25,10 @@ def describe_options(commands: Sequence[str]) -> dict[str, dict[str, dict[str, A
         `is_hint` on the image, and then its `label`.
     """
     context = click.Context(cli)
-    found = {name: cli.get_command(context, name) for name in commands}
+    commands_by_name = {name: cli.get_command(context, name) for name in commands}
     return {
         name: {_name(param): _describe(param) for param in command.params if isinstance(param, click.Option)}
-        for name, command in found.items()
+        for name, command in commands_by_name.items()
         if command is not None
     }
 

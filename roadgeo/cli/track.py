@@ -155,17 +155,17 @@ def track_command(
     opened: Any = open_maps(references, given["near"])
     make_folder(out_dir)
     # Frames are printed as they come; later knowledge of earlier ones replaces their rows.
-    known: dict[int, Tracked] = {}
+    states: dict[int, Tracked] = {}
     pictures = Thumbnails()
     with _sender(mavlink) as send:
         for frame, news in follow_frames(frames, reading, opened, options, unordered):
             pictures.add(frame.number, frame.mask)
-            known.update({state.frame.number: _without_mask(state) for state in news})
+            states.update({state.frame.number: _without_mask(state) for state in news})
             fresh = make_rows(news, start, focal_px)
             send(fresh[-1])
             for row in fresh:
                 _print(row)
-    tracked = [known[number] for number in sorted(known)]
+    tracked = [states[number] for number in sorted(states)]
     if not tracked:
         raise click.UsageError(f"No frames in {', '.join(frames)}.")
     rows = make_rows(tracked, start, focal_px)

@@ -49,7 +49,7 @@ def vectorize_command(
     with show_steps() as say:
         for task in name_tasks(find_masks(images, recursive)):
             try:
-                seen = _show(task, out_dir, gsd_m, reading, say)
+                roads = _show(task, out_dir, gsd_m, reading, say)
             except RoadgeoError as error:
                 complain(str(error))
                 status = ERROR
@@ -60,7 +60,7 @@ def vectorize_command(
                 complain(lack if is_of_memory(error) else what)
                 status = ERROR
                 continue
-            echo(visible(f"{task.mask}: {seen}"))
+            echo(visible(f"{task.mask}: {roads}"))
     return status
 
 
@@ -82,5 +82,5 @@ def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, reading: 
     files = write_vectorized(
         out_dir, task.stem, look.mask, graph, scene.intersections, coarser=look.coarser, photo=photo
     )
-    seen = f"{counted(len(scene.intersections), 'intersection')}, {counted(graph.n_edges, 'road')} between them"
-    return f"{seen}; wrote {', '.join(map(str, files + kept))}"
+    counts = f"{counted(len(scene.intersections), 'intersection')}, {counted(graph.n_edges, 'road')} between them"
+    return f"{counts}; wrote {', '.join(map(str, files + kept))}"

@@ -165,12 +165,12 @@ def _correct(verified: Verified, image: Path, stem: Path, fix: bool, in_place: b
 
 def describe(document: dict[str, Any]) -> str:
     """Print the result of an image, in a line."""
-    verdict, found = document["verdict"], document.get("displacement")
+    verdict, offset = document["verdict"], document.get("displacement")
     word = paint(verdict, _COLORS.get(verdict))
-    if verdict == "off" and found is not None:
+    if verdict == "off" and offset is not None:
         return (
-            f"{document['image']}: {word}: move it {found['east_m']:+.1f} m east, {found['north_m']:+.1f} m north"
-            f" (± {found['sigma_m']:.1f} m), turn it {found['turn_deg']:+.2f}°, scale it by {found['scale']:.4f};"
+            f"{document['image']}: {word}: move it {offset['east_m']:+.1f} m east, {offset['north_m']:+.1f} m north"
+            f" (± {offset['sigma_m']:.1f} m), turn it {offset['turn_deg']:+.2f}°, scale it by {offset['scale']:.4f};"
             f" {document['agreeing']:.0%} of the roads agree then, {document['agreeing_as_given']:.0%} as it is"
         )
     return f"{document['image']}: {word}: {document['reason']}"

@@ -120,9 +120,9 @@ class LocalizabilityMap:
         """Classes at (K, 2) plane positions."""
         row, column = _at(xy, self.grid.cells)
         inside = (row >= 0) & (row < self.classes.shape[0]) & (column >= 0) & (column < self.classes.shape[1])
-        found = np.full(len(xy), UNKNOWN, np.uint8)
-        found[inside] = self.classes[row[inside], column[inside]]
-        return found
+        values = np.full(len(xy), UNKNOWN, np.uint8)
+        values[inside] = self.classes[row[inside], column[inside]]
+        return values
 
 
 def lay_grid(network: RoadNetwork, footprint_m2: float) -> PlaceGrid:
@@ -178,7 +178,7 @@ def _near(xy: FloatArray, cells: MapGrid) -> tuple[AnyArray, AnyArray]:
 
 def _features(network: RoadNetwork, cells: MapGrid, radius: float) -> tuple[AnyArray, FloatArray]:
     """Count intersections within `radius` of every cell, and make the features of a `PlaceGrid`."""
-    found = network.intersections
+    points = network.intersections
     reach = round(radius / cells.resolution)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disc = (np.hypot(x, y) * cells.resolution <= radius).astype(np.float32)
@@ -188,12 +188,12 @@ def _features(network: RoadNetwork, cells: MapGrid, radius: float) -> tuple[AnyA
         np.add.at(layer, _near(xy, cells), 1.0)
         return np.maximum(cv2.filter2D(layer, -1, disc, borderType=cv2.BORDER_CONSTANT), 0.0)
 
-    counts = np.round(spread(found.xy))
-    clear = np.round(spread(found.xy[_clear(found.xy)]))
-    known = np.isfinite(found.tangents)
-    owner, _ = np.nonzero(known)
-    direction = np.floor(found.tangents[known] / math.pi * _DIRECTIONS).astype(int) % _DIRECTIONS
-    layers = np.stack([spread(found.xy[owner[direction == d]]) for d in range(_DIRECTIONS)], axis=-1)
+    counts = np.round(spread(points.xy))
+    clear = np.round(spread(points.xy[_clear(points.xy)]))
+    has_tangent = np.isfinite(points.tangents)
+    owner, _ = np.nonzero(has_tangent)
+    direction = np.floor(points.tangents[has_tangent] / math.pi * _DIRECTIONS).astype(int) % _DIRECTIONS
+    layers = np.stack([spread(points.xy[owner[direction == d]]) for d in range(_DIRECTIONS)], axis=-1)
     shares = layers / np.maximum(layers.sum(axis=-1, keepdims=True), 1.0)
     entropy = -(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=-1)
     return counts, np.stack([np.log1p(counts), entropy, np.log1p(clear)], axis=-1)
@@ -254,19 +254,19 @@ def _covered(network: RoadNetwork, cells: MapGrid) -> BoolArray:
 # --- outputs ----------------------------------------------------------------------------------------------------------
 
 
-def to_geotiff(found: LocalizabilityMap) -> bytes:
+def to_geotiff(raster_map: LocalizabilityMap) -> bytes:
     """Write the classes (band 1, with a colour table) and the probability in percent (band 2) as a GeoTIFF."""
     import rasterio
 
-    grid, cells = found.grid, found.grid.cells
+    grid, cells = raster_map.grid, raster_map.grid.cells
     x, y = grid.plane.to_crs(np.array([cells.west, cells.north]))
-    height, width = found.classes.shape
+    height, width = raster_map.classes.shape
     place = {"crs": grid.plane.crs, "transform": rasterio.Affine(cells.resolution, 0.0, x, 0.0, -cells.resolution, y)}
     kind = {"compress": "deflate", "interleave": "band", "photometric": "minisblack"}
-    percent = np.where(np.isnan(found.probability), 255, np.nan_to_num(found.probability) * 100).round()
+    percent = np.where(np.isnan(raster_map.probability), 255, np.nan_to_num(raster_map.probability) * 100).round()
     with rasterio.MemoryFile() as memory:
         with memory.open(driver="GTiff", width=width, height=height, count=2, dtype="uint8", **place, **kind) as raster:
-            raster.write(found.classes, 1)
+            raster.write(raster_map.classes, 1)
             raster.write(percent.astype(np.uint8), 2)
             raster.set_band_description(
                 1, "class: " + ", ".join(f"{v} {label}" for v, (_, _, label) in PALETTE.items())
@@ -275,14 +275,14 @@ def to_geotiff(found: LocalizabilityMap) -> bytes:
         return bytes(memory.read())
 
 
-def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str) -> AnyArray:
+def draw_localizability(network: RoadNetwork, drawn_map: LocalizabilityMap, title: str) -> AnyArray:
     """Draw the map over its roads, with legend and scale: (height, width, 3) uint8, red, green, blue."""
-    cells, colors = found.grid.cells, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
-    rows, columns = found.classes.shape
+    cells, colors = drawn_map.grid.cells, {value: (*rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
+    rows, columns = drawn_map.classes.shape
     box = (0.0, 0.0, columns * cells.resolution, rows * cells.resolution)
     canvas = Canvas.of(box, _LONGER_PX, _LONGER_PX)
     lines = [(line - (cells.west, cells.north)) * (1.0, -1.0) for line in network.graph.polylines()]
-    classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
+    classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[drawn_map.classes]
     canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])
     draw_scale_bar(canvas, 22)
     legend = []

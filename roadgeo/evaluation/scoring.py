@@ -113,8 +113,8 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
         return answered
     frame = Frame(*(location.get("size") or truth.size))
     points = np.vstack((frame.center, frame.corners))
-    found = Homography(np.array(location["homography"], float)).facing(frame.center)(points)
-    errors = np.hypot(*(found - truth.places(points, location.get("crs"))).T)
+    placed = Homography(np.array(location["homography"], float)).facing(frame.center)(points)
+    errors = np.hypot(*(placed - truth.places(points, location.get("crs"))).T)
     return replace(
         answered,
         right=answered.located and bool(errors[0] <= radius_m),
@@ -163,10 +163,10 @@ class Spread:
 
 
 def _spread(values: Iterable[float]) -> Spread:
-    known = np.array([value for value in values if math.isfinite(value)])
-    if len(known) == 0:
+    finite = np.array([value for value in values if math.isfinite(value)])
+    if len(finite) == 0:
         return Spread(math.nan, math.nan, math.nan)
-    return Spread(*(float(np.quantile(known, q)) for q in (0.5, 0.95, 1.0)))
+    return Spread(*(float(np.quantile(finite, q)) for q in (0.5, 0.95, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -282,8 +282,8 @@ def calibrate_sigma(scores: Sequence[Score]) -> Calibration:
     """Compare the errors of the corners of all right masks with the standard deviations reported for them."""
     errors = np.array([s.corners_m for s in scores if s.right]).reshape(-1, 4)
     sigmas = np.array([s.sigma_m for s in scores if s.right]).reshape(-1, 4)
-    known = np.isfinite(errors) & (sigmas > 0)
-    ratio = errors[known] / sigmas[known]
+    is_known = np.isfinite(errors) & (sigmas > 0)
+    ratio = errors[is_known] / sigmas[is_known]
     if len(ratio) == 0:
         return Calibration(math.nan, math.nan, *(share(0, 0),) * 3)
     within = [share(int((ratio <= k).sum()), len(ratio)) for k in (1, 2, 3)]

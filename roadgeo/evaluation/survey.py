@@ -81,9 +81,9 @@ class Survey:
             masks = DrawnMasks(self.reference, ((self.simulation, count),), centers=at, first=len(places))
             places = np.vstack([places, centers])
             located = np.concatenate([located, _located(self._try(masks, f"{number}"))])
-            found = map_localizability(grid, places, located)
-            hope = np.nan_to_num(found.probability) >= least
-        return found
+            localizability = map_localizability(grid, places, located)
+            hope = np.nan_to_num(localizability.probability) >= least
+        return localizability
 
     def _try(self, masks: QuerySet, part: str) -> list[Trial]:
         record = None
@@ -92,23 +92,25 @@ class Survey:
         with self.counting(len(masks)) as count:
             return run_trials(masks, self.locator, self.jobs, record, self.settings, count)
 
-    def summarize(self, found: LocalizabilityMap) -> dict[str, Any]:
+    def summarize(self, localizability: LocalizabilityMap) -> dict[str, Any]:
         """Return the area of each class, and how many of the test masks were located there."""
         summary: dict[str, Any] = {"schema": "roadgeo.localizability/1", "trials": self.trials, "classes": []}
         checked, located = np.empty(0, np.uint8), np.empty(0, bool)
         if self.check:
             held_out = replace(self.simulation, kind=f"{self.simulation.kind}-check")
             trials = self._try(DrawnMasks(self.reference, ((held_out, self.check),)), "check")
-            checked = found.at(found.grid.plane.from_crs(np.array([trial.truth.center for trial in trials])))
+            checked = localizability.at(
+                localizability.grid.plane.from_crs(np.array([trial.truth.center for trial in trials]))
+            )
             located = _located(trials)
-        known = max(int((found.classes > 0).sum()), 1)
+        n_judged = max(int((localizability.classes > 0).sum()), 1)
         for value, (_, _, label) in list(PALETTE.items())[1:]:
             hits = located[checked == value]
             summary["classes"].append(
                 {
                     "value": value,
                     "label": label,
-                    "area_share": float((found.classes == value).sum() / known),
+                    "area_share": float((localizability.classes == value).sum() / n_judged),
                     "located": asdict(share(int(hits.sum()), len(hits))) if len(hits) else None,
                 }
             )
@@ -136,16 +138,16 @@ def write_survey(
         A file cannot be written, or the trials kept in the folder belong to another survey.
     """
     network = read_network(survey.reference)
-    found = survey.learn(network)
-    window = round(found.grid.footprint_m2**0.5)
+    localizability = survey.learn(network)
+    window = round(localizability.grid.footprint_m2**0.5)
     title = f"{survey.reference.stem}: masks of {window} x {window} m, {survey.simulation.kind}"
     stem = f"{survey.reference.stem}{LOCALIZABILITY}"
     files = [out_dir / f"{stem}{suffix}" for suffix in (".tif", ".qml", ".png", ".json")]
-    write_bytes(files[0], to_geotiff(found))
+    write_bytes(files[0], to_geotiff(localizability))
     write_text(files[1], draw_palette(PALETTE))
     with replacing(files[2]) as temporary:
-        write_png(temporary, draw_localizability(network, found, title))
-    summary = {**survey.summarize(found), "settings": survey.settings, **(further or {})}
+        write_png(temporary, draw_localizability(network, localizability, title))
+    summary = {**survey.summarize(localizability), "settings": survey.settings, **(further or {})}
     write_text(files[3], json.dumps(summary, indent=1) + "\n")
     return summary, files
 

@@ -101,9 +101,9 @@ def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
         return Landscape.from_network(network)
     from roadgeo.sources.roads import read_roads
 
-    found = read_roads(roads)
-    rings = (to_plane(network.plane.crs, found.plane, network.plane.to_crs(ring)) for ring in network.coverage)
-    return Landscape.from_lines(found.lines, found.plane, tuple(rings))
+    roads_read = read_roads(roads)
+    rings = (to_plane(network.plane.crs, roads_read.plane, network.plane.to_crs(ring)) for ring in network.coverage)
+    return Landscape.from_lines(roads_read.lines, roads_read.plane, tuple(rings))
 
 
 @dataclass(frozen=True)

@@ -59,19 +59,19 @@ class _Candidate:
     index : ReferenceIndex
         The map that it was found on.
     matrix : (3, 3) float64
-        Pixel of the frame `seen_at` to reference plane.
+        Pixel of the frame `frame_number` to reference plane.
     log10_likelihood : float
         As it was last weighed.
     """
 
     index: ReferenceIndex
     matrix: FloatArray
-    seen_at: int
+    frame_number: int
     log10_likelihood: float
 
     def under(self, frames: MosaicQuery) -> FloatArray:
         """Return where it puts the mosaic, query plane to reference plane."""
-        to_mosaic = frames.mosaic.to_mosaic[list(frames.numbers).index(self.seen_at)]
+        to_mosaic = frames.mosaic.to_mosaic[list(frames.numbers).index(self.frame_number)]
         matrix = self.matrix @ np.linalg.inv(to_mosaic) @ PIXEL_TO_PLANE
         return np.asarray(matrix / matrix[2, 2])
 
@@ -108,16 +108,16 @@ class Candidates:
         if not frames.searched:
             options = replace(options, match=replace(options.match, sweeps=(), without_roads=(), roads=False))
         proposed: list[Proposed] = [
-            (kept.index, kept.under(frames)) for kept in self._kept if kept.seen_at in frames.numbers
+            (kept.index, kept.under(frames)) for kept in self._kept if kept.frame_number in frames.numbers
         ]
         parts = [part for reference in self.references for part in reference.parts]
-        found = search_references(
+        results = search_references(
             frames.query, parts, options, options.search.time_limit_s, explained=True, proposed=proposed
         )
-        kept = [candidate for result in found for candidate in _proposed(result, frames)]
+        kept = [candidate for result in results for candidate in _proposed(result, frames)]
         self._kept = sorted(kept, key=lambda kept: -kept.log10_likelihood)[:MOST]
         paid = math.log10(max(self.n_searches, 1))  # each search may find a place by chance
-        return decide(frames.query, [result.less_likely(paid) for result in found], options)
+        return decide(frames.query, [result.less_likely(paid) for result in results], options)
 
 
 def _proposed(searched: Searched, frames: MosaicQuery) -> Iterable[_Candidate]:
@@ -126,7 +126,7 @@ def _proposed(searched: Searched, frames: MosaicQuery) -> Iterable[_Candidate]:
     if searched.estimator is None:
         return
     for place in sorted(searched.estimator.verified, key=lambda place: -place.log10_likelihood):
-        if len(best) < MOST and not any(place.same(known) for known in best):
+        if len(best) < MOST and not any(place.same(other) for other in best):
             best.append(place)
             matrix = place.matrix @ PIXEL_TO_PLANE @ frames.mosaic.to_mosaic[-1]
             yield _Candidate(searched.index, matrix, frames.numbers[-1], place.log10_likelihood)

@@ -207,15 +207,15 @@ def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[f
     if options.interval_s is not None or len(paths) < 2:
         return paths, []
     taken = [read_time(path) for path in paths]
-    known = [time for time in taken if time is not None]
-    if len(known) < len(paths) or len({*known}) == 1:
+    times = [time for time in taken if time is not None]
+    if len(times) < len(paths) or len({*times}) == 1:
         _LOG.warning("images are taken to be 1 s apart: not all of them have times of EXIF; --interval says otherwise")
         return paths, []
-    order = sorted(range(len(paths)), key=known.__getitem__)
+    order = sorted(range(len(paths)), key=times.__getitem__)
     if order != [*range(len(paths))]:
         _LOG.warning("frames come in the order of their times, by EXIF, not of their names")
-    of_one = Counter(known)
-    seconds = [known[k] + known[:k].count(known[k]) / of_one[known[k]] for k in order]
+    of_one = Counter(times)
+    seconds = [times[k] + times[:k].count(times[k]) / of_one[times[k]] for k in order]
     return [paths[k] for k in order], [time - seconds[0] for time in seconds]
 
 
@@ -326,16 +326,14 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
     with open_photograph(image.path, reading.bands) as opened:
         photograph = opened.stretched(*image.stretch)
         if last.scale is None:
-            known = options.gsd_m
-            ways = (
-                rank_scales(photograph, network) if known is None else [scale_of(math.sqrt(math.prod(known)), network)]
-            )
-            last.scale = next(iter(ways))
+            gsd_m = None if options.gsd_m is None else math.sqrt(math.prod(options.gsd_m))
+            scales = rank_scales(photograph, network) if gsd_m is None else [scale_of(gsd_m, network)]
+            last.scale = next(iter(scales))
         shape = photograph.height, photograph.width
-        seen = segment(photograph, network, last.scale).resized(shape)
+        probability = segment(photograph, network, last.scale).resized(shape)
         rgb, _ = photograph.read(0.0, 0.0, float(photograph.width), float(photograph.height), shape)
     try:
-        mask = seen.mask(seen.threshold if reading.threshold is None else reading.threshold)
+        mask = probability.mask(probability.threshold if reading.threshold is None else reading.threshold)
     except MaskError:
         mask = RoadMask(np.zeros(shape, np.bool_))
     return replace(mask, name=image.name), np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
@@ -346,9 +344,9 @@ def _motion(
 ) -> tuple[FloatArray | None, float]:
     """Return how a frame moved against the one before, and how far off that may put a corner, pixels."""
     if options.motion is not None:
-        found = options.motion.get(image.name, options.motion.get(Path(image.name).stem))
+        matrix = options.motion.get(image.name, options.motion.get(Path(image.name).stem))
         square = np.diag([*image.stretch, 1.0])  # the user knows the motion of pixels as they are stored
-        return None if found is None else square @ found @ np.linalg.inv(square), 1.5
+        return None if matrix is None else square @ matrix @ np.linalg.inv(square), 1.5
     if last.mask is None or last.mask.shape != mask.shape:
         last.odometer = Odometer()  # another camera: the previous motion does not apply
         return None, 1.5

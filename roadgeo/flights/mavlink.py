@@ -52,26 +52,26 @@ class PositionFix:
     taken_s: float
 
 
-def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
+def fix_of(row: Mapping[str, Any], taken_s: float) -> PositionFix | None:
     """Return our position, from a frame's row or a location as plain values; None where that is not known.
 
     It is the place of the camera where its focal length was given, and otherwise the frame's middle. The place of a
     frame whose roads contradict its motion is not known.
     """
-    if found.get("status") == "predicted" and found.get("log10_odds") is not None:
+    if row.get("status") == "predicted" and row.get("log10_odds") is not None:
         return None
-    camera = found.get("camera")
+    camera = row.get("camera")
     if camera and camera.get("source", "camera") == "camera":
         stated = camera.get("sigma")
-        known = found.get("lonlat_accuracy_m") or 0.0
-        sigma = camera["sigma_m"] if stated is None else math.hypot(stated["x_m"], stated["y_m"], known)
+        accuracy_m = row.get("lonlat_accuracy_m") or 0.0
+        sigma = camera["sigma_m"] if stated is None else math.hypot(stated["x_m"], stated["y_m"], accuracy_m)
         return PositionFix(camera["lon"], camera["lat"], sigma, taken_s)
-    if found.get("center") is None or found.get("status") == "ambiguous":
+    if row.get("center") is None or row.get("status") == "ambiguous":
         return None
-    sigma = found.get("sigma_m")
+    sigma = row.get("sigma_m")
     if sigma is None:
-        sigma = max(found.get("lonlat_sigma_m") or found.get("corner_sigma_m") or [math.nan])
-    return PositionFix(found["center"]["lon"], found["center"]["lat"], sigma, taken_s)
+        sigma = max(row.get("lonlat_sigma_m") or row.get("corner_sigma_m") or [math.nan])
+    return PositionFix(row["center"]["lon"], row["center"]["lat"], sigma, taken_s)
 
 
 def has_pymavlink() -> bool:

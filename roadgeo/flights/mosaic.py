@@ -117,8 +117,8 @@ def lay_down(masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float) ->
     to_pixel = np.array([[scale, 0.0, -scale * low[0]], [0.0, scale, -scale * low[1]], [0.0, 0.0, 1.0]])
     to_mosaic = to_pixel @ levelled
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
-    shown, seen, probability = _paint_all(masks, to_mosaic, (rows, columns))
-    return Mosaic(RoadMask(shown, seen, masks[0].name, probability), to_mosaic)
+    shown, observed, probability = _paint_all(masks, to_mosaic, (rows, columns))
+    return Mosaic(RoadMask(shown, observed, masks[0].name, probability), to_mosaic)
 
 
 def _paint_all(
@@ -128,15 +128,15 @@ def _paint_all(
 
     The probability is the mean of the frames', as in `RoadMask`; None where they have none.
     """
-    roads, seen = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    roads, observed = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     total = np.zeros(shape, np.uint16) if any(mask.probability is not None for mask in masks) else None
     for mask, matrix in zip(masks, matrices, strict=True):
-        _paint(mask, matrix, roads, seen, total)
-    shown = (seen > 0) & (roads > _SHARE * seen)
+        _paint(mask, matrix, roads, observed, total)
+    shown = (observed > 0) & (roads > _SHARE * observed)
     if total is None:
-        return shown, seen > 0, None
-    mean = np.minimum(total // np.maximum(seen, 1), PROBABILITY_SURE)
-    return shown, seen > 0, np.where(seen > 0, mean, PROBABILITY_UNKNOWN).astype(np.uint8)
+        return shown, observed > 0, None
+    mean = np.minimum(total // np.maximum(observed, 1), PROBABILITY_SURE)
+    return shown, observed > 0, np.where(observed > 0, mean, PROBABILITY_UNKNOWN).astype(np.uint8)
 
 
 def _is_sound(corners: FloatArray) -> bool:
@@ -148,7 +148,7 @@ def _is_sound(corners: FloatArray) -> bool:
     return bool(areas.min() > 0.0 and areas.max() < 16.0 * areas.min())
 
 
-def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray, total: AnyArray | None) -> None:
+def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, count: AnyArray, total: AnyArray | None) -> None:
     """Count where a frame shows road, and where it sees at all, on the mosaic; both (R, C) uint8 are changed.
 
     `total` (R, C) uint16: the probability of road is added to it.
@@ -166,7 +166,7 @@ def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray, 
     )
     roads[part] += cv2.warpPerspective(values, warp, size, flags=cv2.INTER_AREA) > 127
     sees = cv2.warpPerspective(known, warp, size, flags=cv2.INTER_NEAREST) > 127
-    seen[part] += sees
+    count[part] += sees
     if total is not None:
         sure = mask.roads * np.uint8(PROBABILITY_SURE) if mask.probability is None else mask.probability
         sure = np.where(sure == PROBABILITY_UNKNOWN, np.uint8(0), sure)

@@ -79,16 +79,16 @@ def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
         raise RoadSourceError(f"cannot read {path}: {cause}; expected a CSV file of motions") from error
     try:
         rows = list(csv.DictReader(io.StringIO(text)))
-        found = {row["frame"]: np.array([float(row[name]) for name in _COLUMNS]).reshape(3, 3) for row in rows}
+        matrices = {row["frame"]: np.array([float(row[name]) for name in _COLUMNS]).reshape(3, 3) for row in rows}
     except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise RoadSourceError(
             f"{path} is no table of motions ({type(error).__name__}: {error}); expected the columns frame, h00 ... h22"
         ) from error
-    bad = [name for name, matrix in found.items() if not np.isfinite(matrix).all() or not np.linalg.det(matrix)]
-    if bad or not found:
+    bad = [name for name, matrix in matrices.items() if not np.isfinite(matrix).all() or not np.linalg.det(matrix)]
+    if bad or not matrices:
         what = f"frame {bad[0]} has no homography" if bad else "it has no rows"
         raise RoadSourceError(f"{path} is no table of motions: {what}; expected 3 x 3 numbers that can be inverted")
-    return found
+    return matrices
 
 
 # --- photographs ------------------------------------------------------------------------------------------------------
@@ -98,17 +98,17 @@ def between_images(before: AnyArray, image: AnyArray) -> FloatArray | None:
     """Return the motion between two grey photographs (H, W) uint8; None where hardly anything is seen in both."""
     scale = min(1.0, _IMAGE_SIDE / max(*image.shape, *before.shape))
     finder = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined]
-    found = [
+    features = [
         finder.detectAndCompute(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), None)
         for grey in (before, image)
     ]
-    if any(descriptors is None or len(points) < _FEWEST_FEATURES for points, descriptors in found):
+    if any(descriptors is None or len(points) < _FEWEST_FEATURES for points, descriptors in features):
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(found[1][1], found[0][1])
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(features[1][1], features[0][1])
     if len(pairs) < _FEWEST_FEATURES:
         return None
-    source = np.array([found[1][0][pair.queryIdx].pt for pair in pairs])
-    target = np.array([found[0][0][pair.trainIdx].pt for pair in pairs])
+    source = np.array([features[1][0][pair.queryIdx].pt for pair in pairs])
+    target = np.array([features[0][0][pair.trainIdx].pt for pair in pairs])
     matrix, agree = cv2.findHomography(source, target, cv2.USAC_MAGSAC, 2.0, maxIters=5000, confidence=0.999)
     if matrix is None or int(agree.sum()) < _FEWEST_FEATURES:
         return None
@@ -141,19 +141,21 @@ class Odometer:
         float
             Standard deviation of a corner, pixels.
         """
-        known = self._traced if self._traced is not None and self._traced.mask is before else TracedMask.of(before)
+        previous = self._traced if self._traced is not None and self._traced.mask is before else TracedMask.of(before)
         self._traced = TracedMask.of(mask)
-        found = None if known is None or self._traced is None else between_masks(known, self._traced, self._motion)
-        if found is not None:
-            self._motion, self._held = found, 0
-            return found, _MASKS_PX
+        motion = (
+            None if previous is None or self._traced is None else between_masks(previous, self._traced, self._motion)
+        )
+        if motion is not None:
+            self._motion, self._held = motion, 0
+            return motion, _MASKS_PX
         self._held += 1
         if self._held > _MOST_HELD:
             self._motion = None
         return self._motion, _HELD_PX
 
 
-class _Laid(NamedTuple):
+class _Alignment(NamedTuple):
     """A mask laid on another: how, the shares of either's roads that agree, and of the frame that both see.
 
     Where frames share less, less can disagree: the quality is the agreement, times the root of the shared part.
@@ -172,7 +174,7 @@ class _Laid(NamedTuple):
     def fit(self) -> float:
         return self.agreement * math.sqrt(self.shared)
 
-    def rivals(self, other: _Laid) -> bool:
+    def rivals(self, other: _Alignment) -> bool:
         """Whether it fits, or agrees where enough is shared, about as well: streets that repeat do."""
         agrees = self.shared >= _LEAST_SHARED and self.agreement > other.agreement - _LEAD_FIRST
         return agrees or self.fit > other.fit - _LEAD_FIRST
@@ -191,31 +193,31 @@ def between_masks(first: TracedMask, other: TracedMask, last: FloatArray | None 
     guesses = _rough_motions(first.mask, other.mask, 2 * len(_TURNS_DEG))
     if last is not None:
         guesses = [last, *(guess for guess in guesses if _otherwise(guess, last, frame) < 2.0 * _STEADY)]
-    laid = [found for guess in guesses if (found := _lay(guess, frame, first, other)) is not None]
-    return _surest(laid, frame) if last is None else _steadiest(laid, last, frame)
+    alignments = [alignment for guess in guesses if (alignment := _lay(guess, frame, first, other)) is not None]
+    return _surest(alignments, frame) if last is None else _steadiest(alignments, last, frame)
 
 
-def _surest(laid: Sequence[_Laid], frame: Frame) -> FloatArray | None:
+def _surest(alignments: Sequence[_Alignment], frame: Frame) -> FloatArray | None:
     """Return the motion that fits best; None where that is little, or another one fits as well."""
-    best = max(laid, key=lambda found: found.fit, default=None)
+    best = max(alignments, key=lambda alignment: alignment.fit, default=None)
     if best is None or best.fit < _LEAST_FIRST:
         return None
-    others = (found for found in laid if not _is_same_motion(found.motion, best.motion, frame))
-    return None if any(found.rivals(best) for found in others) else best.motion
+    others = (alignment for alignment in alignments if not _is_same_motion(alignment.motion, best.motion, frame))
+    return None if any(alignment.rivals(best) for alignment in others) else best.motion
 
 
-def _steadiest(laid: Sequence[_Laid], last: FloatArray, frame: Frame) -> FloatArray | None:
+def _steadiest(alignments: Sequence[_Alignment], last: FloatArray, frame: Frame) -> FloatArray | None:
     """Return the motion that fits best, and goes on as the one before; None where that is little."""
-    worth = [
-        (found.fit - _OTHERWISE * off, found)
-        for found in laid
-        if (off := _otherwise(found.motion, last, frame)) < _STEADY
+    rated = [
+        (alignment.fit - _OTHERWISE * off, alignment)
+        for alignment in alignments
+        if (off := _otherwise(alignment.motion, last, frame)) < _STEADY
     ]
-    fit, best = max(worth, key=lambda pair: pair[0], default=(0.0, None))
+    fit, best = max(rated, key=lambda pair: pair[0], default=(0.0, None))
     return best.motion if best is not None and fit >= _LEAST_AGAIN else None
 
 
-def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Laid | None:
+def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Alignment | None:
     """Lay a mask on another, near a rough motion; None where they hardly share a road."""
     corners = Homography(guess).facing(frame.center)(frame.corners)
     if not np.isfinite(corners).all():
@@ -228,7 +230,7 @@ def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) 
     motion = np.asarray(motion / motion[2, 2])
     there = _agreement(motion, frame, other.scene, first.roads)
     back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, first.scene, other.roads)
-    return _Laid(motion, there, back, _shared(motion, frame))
+    return _Alignment(motion, there, back, _shared(motion, frame))
 
 
 @dataclass(frozen=True)
@@ -262,18 +264,20 @@ def overlay(first: TracedMask, other: TracedMask) -> list[tuple[FloatArray, floa
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    laid: list[_Laid | None] = []
+    alignments: list[_Alignment | None] = []
     for turn in (np.eye(3), _half_turn(frame)):
-        seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
-        laid += [_lay(guess @ turn, frame, first, other) for guess in _rough_motions(first.mask, seen, 4)]
+        shown = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
+        alignments += [_lay(guess @ turn, frame, first, other) for guess in _rough_motions(first.mask, shown, 4)]
     overlaps = [
-        (found.motion, min(found.there, found.back) * found.shared)
-        for found in laid
-        if found is not None and min(found.there, found.back) >= _LEAST_SHARE and found.shared >= _LEAST_SHARED
+        (alignment.motion, min(alignment.there, alignment.back) * alignment.shared)
+        for alignment in alignments
+        if alignment is not None
+        and min(alignment.there, alignment.back) >= _LEAST_SHARE
+        and alignment.shared >= _LEAST_SHARED
     ]
     distinct: list[tuple[FloatArray, float]] = []
     for motion, sure in sorted(overlaps, key=lambda pair: -pair[1]):
-        if not any(_is_same_motion(motion, known, frame) for known, _ in distinct):
+        if not any(_is_same_motion(motion, chosen, frame) for chosen, _ in distinct):
             distinct.append((motion, sure))
     return distinct[:3]
 
@@ -331,7 +335,7 @@ def _rough_motions(before: RoadMask, mask: RoadMask, count: int) -> list[FloatAr
     size = (round(width * scale), round(height * scale))
     grown = (2 * size[1], 2 * size[0])
     fixed = np.conj(np.fft.rfft2(_soft(before.roads, size), grown))
-    center, found = np.array([width, height]) / 2.0, []
+    center, motions = np.array([width, height]) / 2.0, []
     reduced = _soft(mask.roads, size)
     for degrees in _TURNS_DEG:
         turn = cv2.getRotationMatrix2D(((size[0] - 1) / 2.0, (size[1] - 1) / 2.0), degrees, 1.0)
@@ -341,20 +345,20 @@ def _rough_motions(before: RoadMask, mask: RoadMask, count: int) -> list[FloatAr
         far = (np.abs(rows)[:, None] > _FARTHEST * size[1]) | (np.abs(columns)[None] > _FARTHEST * size[0])
         # Where frames overlap less, less can agree.
         shared = (1.0 - np.abs(rows)[:, None] / size[1]).clip(0.1) * (1.0 - np.abs(columns)[None] / size[0]).clip(0.1)
-        worth = np.where(far, -np.inf, cover / np.sqrt(shared))
+        rating = np.where(far, -np.inf, cover / np.sqrt(shared))
         angle = math.radians(degrees)
         # OpenCV's angles turn counterclockwise as seen, in pixels with rows downwards.
         rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         for _ in range(2):
-            row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
+            row, column = np.unravel_index(int(np.argmax(rating)), rating.shape)
             shift = np.array([columns[column], rows[row]]) / scale
             motion = np.eye(3)
             motion[:2, :2], motion[:2, 2] = rotation, center - rotation @ center + shift
-            found.append((float(worth[row, column]), motion))
+            motions.append((float(rating[row, column]), motion))
             around = (np.abs(rows - rows[row]) < 8)[:, None] & (np.abs(columns - columns[column]) < 8)[None]
-            worth[around] = -np.inf
-    found.sort(key=lambda pair: -pair[0])
-    return [motion for _, motion in found[:count]]
+            rating[around] = -np.inf
+    motions.sort(key=lambda pair: -pair[0])
+    return [motion for _, motion in motions[:count]]
 
 
 def _soft(roads: AnyArray, size: tuple[int, int]) -> AnyArray:

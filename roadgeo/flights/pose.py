@@ -179,10 +179,10 @@ def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
         Standard deviation of where the motion puts a corner.
     """
     local = _Local.of(pose)
-    seen = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
-    if not np.isfinite(seen).all():
+    before = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
+    if not np.isfinite(before).all():
         return None
-    uv = local.query(seen * (1.0, -1.0))
+    uv = local.query(before * (1.0, -1.0))
     p = local.parameters(pose.corners)
     if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
         return None
@@ -221,9 +221,9 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
     Two unit vectors on the plane are perpendicular and equally long; how far a camera sees them from that.
     """
     near = state + 1e-6 * np.vstack((np.zeros(9), np.eye(9), -np.eye(9)))
-    seen = np.linalg.inv(np.insert(near[:, :8], 8, 1.0, axis=1).reshape(-1, 3, 3))[:, :, :2]
-    seen[:, :2] /= np.exp(near[:, 8])[:, None, None]
-    (aa, ab), (_, bb) = np.moveaxis(np.swapaxes(seen, 1, 2) @ seen, 0, -1)
+    inverse = np.linalg.inv(np.insert(near[:, :8], 8, 1.0, axis=1).reshape(-1, 3, 3))[:, :, :2]
+    inverse[:, :2] /= np.exp(near[:, 8])[:, None, None]
+    (aa, ab), (_, bb) = np.moveaxis(np.swapaxes(inverse, 1, 2) @ inverse, 0, -1)
     skews = np.stack((ab / np.sqrt(aa * bb), 0.5 * np.log(aa / bb)))
     return skews[:, 0], (skews[:, 1:10] - skews[:, 10:]) / 2e-6
 

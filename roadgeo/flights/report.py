@@ -99,7 +99,7 @@ def render_flight(
         return render_page(title, text, "", [f"<p>The flight was not located: {why}</p>"])
     # Footprints in metres from the corner of the map that is shown.
     maps = [frame.reference for frame in tracked]
-    there = [k for k, known in enumerate(maps) if known is not None and known.name == reference.name]
+    there = [k for k, on_map in enumerate(maps) if on_map is not None and on_map.name == reference.name]
     corners = {k: _corners(tracked[k]) for k in there}
     window = Window.around(np.concatenate(list(corners.values())), _MARGIN).no_longer_than(2.0)
     rings = {k: window.place(ring) for k, ring in corners.items()}
@@ -168,6 +168,6 @@ def _values(rows: Sequence[Row], rings: Mapping[int, FloatArray], pictures: Mapp
         }
         for k, row in enumerate(rows)
     ]
-    known = [k for k, row in enumerate(rows) if row.center is not None]
-    text = json.dumps({"frames": frames, "colors": _COLORS, "start": known[-1] if known else 0})
+    placed = [k for k, row in enumerate(rows) if row.center is not None]
+    text = json.dumps({"frames": frames, "colors": _COLORS, "start": placed[-1] if placed else 0})
     return text.replace("<", "\\u003c")

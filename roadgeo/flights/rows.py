@@ -133,10 +133,10 @@ def _row(tracked: Tracked, begun: datetime | None, focal_px: float | None) -> Ro
 def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
     """Find the camera of a focal length behind a frame; None where it would lie below the ground."""
     size = round(pose.frame.width), round(pose.frame.height)
-    found = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], focal_px)
-    if found is None:
+    camera = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], focal_px)
+    if camera is None:
         return None
-    lon, lat = to_lonlat(plane.crs, plane.to_crs(found.position[None, :2]))[0]
+    lon, lat = to_lonlat(plane.crs, plane.to_crs(camera.position[None, :2]))[0]
     inexact = exactness(plane.crs, LONLAT, (lon, lat)).sigma_m
-    sigma = math.hypot(math.sqrt(float(np.trace(found.covariance[:2, :2]))), inexact)
-    return CameraPlace(float(lon), float(lat), float(found.position[2]), sigma)
+    sigma = math.hypot(math.sqrt(float(np.trace(camera.covariance[:2, :2]))), inexact)
+    return CameraPlace(float(lon), float(lat), float(camera.position[2]), sigma)

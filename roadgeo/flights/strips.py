@@ -124,20 +124,20 @@ class _Net:
 
     def _spread(self, tracker: Tracker, first: int, surest: Tracked) -> list[Tracked]:
         """Place frames beside those that are placed, along the surest links first."""
-        known = {first: surest}
+        placed = {first: surest}
         left = sorted(self.links, key=lambda link: -link.weight)
         while (
-            link := next((link for link in left if (link.first in known) != (link.other in known)), None)
+            link := next((link for link in left if (link.first in placed) != (link.other in placed)), None)
         ) is not None:
             left.remove(link)
-            at, to = (link.first, link.other) if link.first in known else (link.other, link.first)
+            at, to = (link.first, link.other) if link.first in placed else (link.other, link.first)
             motion = link.motion if at == link.first else np.asarray(np.linalg.inv(link.motion), float)
             frame = replace(self.frames[to], motion=motion, motion_px=_LINK_PX)
-            beside = tracker.place_beside(known[at], frame)
+            beside = tracker.place_beside(placed[at], frame)
             if self._stands(beside):
-                known[to] = beside
+                placed[to] = beside
         why = "its roads do not agree with the map where its neighbours put it"
-        return [known.get(k, Tracked(frame, "lost", why, frame.number)) for k, frame in enumerate(self.frames)]
+        return [placed.get(k, Tracked(frame, "lost", why, frame.number)) for k, frame in enumerate(self.frames)]
 
     def _stands(self, tracked: Tracked) -> bool:
         """Whether a frame is where it was put, and not a block beside; a frame without roads is."""
@@ -162,7 +162,7 @@ def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) 
     for i, j in combinations(range(len(frames)), 2):
         if frames[i].mask.shape != frames[j].mask.shape:
             continue
-        links += [Link(i, j, *found) for found in _link(traced[i], traced[j], greys[i], greys[j])]
+        links += [Link(i, j, *measured) for measured in _link(traced[i], traced[j], greys[i], greys[j])]
     return links
 
 

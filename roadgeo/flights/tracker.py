@@ -229,7 +229,7 @@ class Tracker:
         self._pose, self._reference = None, None
         self._window, self._doubtful = list(doubtful), []
         self._forget()
-        return [Tracked(doubt.frame, "lost", why, known_at) for doubt in doubtful]
+        return [Tracked(item.frame, "lost", why, known_at) for item in doubtful]
 
     def _forget(self) -> None:
         """Forget what earlier frames proposed."""
@@ -252,15 +252,15 @@ class Tracker:
             self._forget()
             return [Tracked(frame, "lost", "no camera moves like this; begun anew", frame.number)]
         query = _read(mosaic)
-        n_seen = 0 if query is None else len(query.scene.intersections)
+        n_shown = 0 if query is None else len(query.scene.intersections)
         least = max(_FEWEST, self._searched_at + _MORE)
-        if query is None or (n_seen < least and not self._candidates):
-            why = f"waits: {len(masks)} frames show {n_seen} intersections, looked for again with {least}"
+        if query is None or (n_shown < least and not self._candidates):
+            why = f"waits: {len(masks)} frames show {n_shown} intersections, looked for again with {least}"
             return [Tracked(frame, "lost", why, frame.number)]
         self._waited += 1
-        searched = n_seen >= least or self._waited >= _MORE_FRAMES
+        searched = n_shown >= least or self._waited >= _MORE_FRAMES
         if searched:
-            self._searched_at, self._waited = n_seen, 0
+            self._searched_at, self._waited = n_shown, 0
         frames = MosaicQuery(query, mosaic, [member.frame.number for member in self._window], searched)
         location = self._candidates.decide(frames, self.search_options(mosaic, masks))
         if not location.located:
@@ -288,14 +288,14 @@ class Tracker:
         self._window = [_Waiting(frame, _trace(frame.mask)) for frame in frames]
         return self._settle(location, mosaic)
 
-    def place_beside(self, known: Tracked, frame: FlightFrame) -> Tracked:
+    def place_beside(self, beside: Tracked, frame: FlightFrame) -> Tracked:
         """Place a frame from another one, whose place is known and to whose pixels its motion leads."""
-        self._pose, self._reference = known.pose, known.reference
+        self._pose, self._reference = beside.pose, beside.reference
         return self._step(_Waiting(frame, _trace(frame.mask)), frame.number, "located")
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
-        reference = next(known for known in self.references if known.name == location.reference)
+        reference = next(candidate for candidate in self.references if candidate.name == location.reference)
         plane = reference.index.plane
         first, last = self._window[0].frame, self._window[-1].frame
         self._reference = reference
@@ -344,8 +344,8 @@ class Tracker:
 
 def latest(learnt: Iterable[tuple[FlightFrame, list[Tracked]]]) -> list[Tracked]:
     """Return the final state of each frame, in order."""
-    known = {state.frame.number: state for _, news in learnt for state in news}
-    return [known[number] for number in sorted(known)]
+    states = {state.frame.number: state for _, news in learnt for state in news}
+    return [states[number] for number in sorted(states)]
 
 
 def follow(

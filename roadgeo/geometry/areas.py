@@ -32,11 +32,11 @@ def find_area(text: str) -> Box:
         raise ValueError(f"got {text!r}, expected {_BOUNDS} or the name of a country or state")
     if wanted in extents:
         return extents[wanted][1]
-    ending = [known for known in extents if known.rpartition(" - ")[2] == wanted]
+    ending = [extent for extent in extents if extent.rpartition(" - ")[2] == wanted]
     if len(ending) == 1:
         return extents[ending[0]][1]
     if ending:
-        names = " or ".join(extents[known][0] for known in sorted(ending)[:6])
+        names = " or ".join(extents[extent][0] for extent in sorted(ending)[:6])
         raise ValueError(f"{text!r} may be {names}: give the whole name")
     import difflib
 

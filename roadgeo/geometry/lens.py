@@ -46,16 +46,16 @@ class Lens:
         if self.k1 == 0.0:
             return np.asarray(points, float)
         offset = (points - self.center) / self.half_side
-        seen = np.hypot(offset[..., 0], offset[..., 1])
-        scale = np.divide(self._radius(seen), seen, out=np.ones_like(seen), where=seen > 0)
+        distorted = np.hypot(offset[..., 0], offset[..., 1])
+        scale = np.divide(self._radius(distorted), distorted, out=np.ones_like(distorted), where=distorted > 0)
         return np.asarray(self.center + self.half_side * offset * scale[..., None])
 
     def stretch(self, points: FloatArray) -> FloatArray:
         """Return the derivative (..., 2, 2) of `straighten(points)` by the points."""
         offset = (points - self.center) / self.half_side
-        seen = np.hypot(offset[..., 0], offset[..., 1])
-        square = self._radius(seen) ** 2
-        radial = np.divide(offset, seen[..., None], out=np.zeros_like(offset), where=seen[..., None] > 0)
+        distorted = np.hypot(offset[..., 0], offset[..., 1])
+        square = self._radius(distorted) ** 2
+        radial = np.divide(offset, distorted[..., None], out=np.zeros_like(offset), where=distorted[..., None] > 0)
         across, outwards = 1.0 / (1.0 + self.k1 * square), 1.0 / (1.0 + 3.0 * self.k1 * square)
         along = radial[..., :, None] * radial[..., None, :]
         return np.asarray(across[..., None, None] * np.eye(2) + (outwards - across)[..., None, None] * along)
@@ -75,14 +75,14 @@ class Lens:
         """Return the distance, as a pinhole sees it, up to which the lens does not fold over."""
         return math.inf if self.k1 >= 0.0 else _UNFOLDED / math.sqrt(-3.0 * self.k1)
 
-    def _radius(self, seen: FloatArray) -> FloatArray:
+    def _radius(self, distorted: FloatArray) -> FloatArray:
         """Solve r (1 + k1 r^2) = seen, by Newton's method from where it converges."""
         if self.k1 == 0.0:
-            return seen
+            return distorted
         farthest = self._farthest()
         if math.isfinite(farthest):
-            seen = np.minimum(seen, farthest * (1.0 + self.k1 * farthest**2))
-        r = seen.copy()
+            distorted = np.minimum(distorted, farthest * (1.0 + self.k1 * farthest**2))
+        r = distorted.copy()
         for _ in range(_NEWTON_STEPS):
-            r -= (r * (1.0 + self.k1 * r * r) - seen) / (1.0 + 3.0 * self.k1 * r * r)
+            r -= (r * (1.0 + self.k1 * r * r) - distorted) / (1.0 + 3.0 * self.k1 * r * r)
         return r

@@ -101,15 +101,15 @@ def find_pose(
     usual = USUAL_FOCAL * frame.half_diagonal
     tried = [focal_px] if focal_px else [usual * factor for factor in _FACTORS]
     prior = math.log(focal_px or usual), 1e-6 if focal_px else USUAL_SIGMA
-    seen = SeenCorners((frame.corners - frame.center) * (1.0, -1.0), corners, whitener(corner_covariance), *prior)
-    fitted = fit_pinhole(_starts(homography, frame, np.array(tried), seen.log_focal), seen)
+    targets = CornerTargets((frame.corners - frame.center) * (1.0, -1.0), corners, whitener(corner_covariance), *prior)
+    fitted = fit_pinhole(_starts(homography, frame, np.array(tried), targets.log_focal), targets)
     if fitted is None:
         return None
-    pose = _describe(*fitted, seen.log_focal, bool(focal_px))
+    pose = _describe(*fitted, targets.log_focal, bool(focal_px))
     return replace(pose, position=pose.position + origin)
 
 
-class SeenCorners(NamedTuple):
+class CornerTargets(NamedTuple):
     """The corners fitted to, and the prior on the focal length.
 
     `pixels` (4, 2) are the corners from the middle of the frame, y up; `ground` (4, 2) where they lie, metres;
@@ -124,7 +124,7 @@ class SeenCorners(NamedTuple):
 
 
 def fit_pinhole(
-    starts: FloatArray, seen: SeenCorners, n_iterations: int = _STEPS
+    starts: FloatArray, targets: CornerTargets, n_iterations: int = _STEPS
 ) -> tuple[FloatArray, FloatArray] | None:
     """Fit a pinhole by Levenberg and Marquardt, from the start (S, 7) that is nearest; None where that fails.
 
@@ -132,7 +132,7 @@ def fit_pinhole(
     """
 
     def off(p: FloatArray) -> FloatArray:
-        return pinhole_residuals(p, seen)
+        return pinhole_residuals(p, targets)
 
     sums = (off(starts) ** 2).sum(axis=-1)
     if not np.isfinite(sums).any():
@@ -162,26 +162,26 @@ def fit_pinhole(
     jacobian = _differentiate(off, p, scale)
     if not np.isfinite(jacobian).all() or np.linalg.matrix_rank(jacobian / np.linalg.norm(jacobian, axis=0)) < 7:
         return None
-    (_, _, height), _ = _place(p, seen.log_focal)
+    (_, _, height), _ = _place(p, targets.log_focal)
     return (p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))) if height > 0.0 else None
 
 
-def pinhole_residuals(p: FloatArray, seen: SeenCorners) -> FloatArray:
+def pinhole_residuals(p: FloatArray, targets: CornerTargets) -> FloatArray:
     """Return how far off corners are, whitened, and the focal length from usual ones, (..., 9) of parameters (..., 7).
 
     The parameters are x and y where the axis meets the ground, log metres per pixel there, the heading, the tilt about
     two axes were the focal length as in `log_focal`, and the log of the focal length, with which the tilt grows in
     proportion. Infinite where a corner does not lie below the horizon.
     """
-    positions, rotations = _place(p, seen.log_focal)
-    corners = np.broadcast_to(seen.pixels, (*p.shape[:-1], 4, 2))
+    positions, rotations = _place(p, targets.log_focal)
+    corners = np.broadcast_to(targets.pixels, (*p.shape[:-1], 4, 2))
     focal = np.broadcast_to(-np.exp(p[..., 6])[..., None, None], (*p.shape[:-1], 4, 1))
     rays = np.concatenate((corners, focal), axis=-1) @ np.swapaxes(rotations, -1, -2)
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = positions[..., 2, None] / rays[..., 2]
-        away = positions[..., None, :2] - reach[..., None] * rays[..., :2] - seen.ground
-    whitened = away.reshape(*p.shape[:-1], 8) @ seen.weights.T
-    prior = (p[..., 6:] - seen.log_focal) / seen.log_focal_sigma
+        away = positions[..., None, :2] - reach[..., None] * rays[..., :2] - targets.ground
+    whitened = away.reshape(*p.shape[:-1], 8) @ targets.weights.T
+    prior = (p[..., 6:] - targets.log_focal) / targets.log_focal_sigma
     below = np.asarray((rays[..., 2] < 0.0).all(axis=-1))[..., None]
     return np.asarray(np.where(below, np.concatenate((whitened, prior), axis=-1), np.inf))
 

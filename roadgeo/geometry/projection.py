@@ -130,9 +130,9 @@ def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
     """
     from pyproj import Geod
 
-    known = known_crs(crs)
-    axes = {(axis.direction, axis.unit_name) for axis in known.axis_info[:2]}
-    if not known.is_projected or axes != {("east", "metre"), ("north", "metre")}:
+    resolved = known_crs(crs)
+    axes = {(axis.direction, axis.unit_name) for axis in resolved.axis_info[:2]}
+    if not resolved.is_projected or axes != {("east", "metre"), ("north", "metre")}:
         return False
     # Steps of 100 m on the ellipsoid, measured in the CRS: independent of the metadata of the projection.
     some = lonlat[:: max(len(lonlat) // 200, 1)]

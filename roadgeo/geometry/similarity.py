@@ -88,9 +88,9 @@ def fit_similarity(
     """
     design, weights, origin = _design(points), whitener(covariance), places.mean(axis=0)
     observed = (places - origin).ravel()
-    found = np.asarray(np.linalg.inv((weights @ design).T @ (weights @ design)))
-    parameters = found @ (weights @ design).T @ (weights @ observed)
-    return parameters + np.append([0.0, 0.0], origin), found, observed - design @ parameters
+    inverse = np.asarray(np.linalg.inv((weights @ design).T @ (weights @ design)))
+    parameters = inverse @ (weights @ design).T @ (weights @ observed)
+    return parameters + np.append([0.0, 0.0], origin), inverse, observed - design @ parameters
 
 
 def _design(points: FloatArray) -> FloatArray:

@@ -45,9 +45,9 @@ class Exactness(NamedTuple):
             return f"{what} are not known how exact: PROJ knows no way from datum to datum" * math.isnan(self.sigma_m)
         named, alone = " and ".join(self.grids), len(self.grids) == 1
         sync = " && ".join(f"pyproj sync --file {grid}" for grid in self.grids)
-        known = "not known how exact" if math.isnan(self.sigma_m) else f"good to {self.sigma_m:g} m only"
+        accuracy = "not known how exact" if math.isnan(self.sigma_m) else f"good to {self.sigma_m:g} m only"
         return (
-            f"{what} are {known}: PROJ lacks the grid{'' if alone else 's'} {named}, with which they are good to "
+            f"{what} are {accuracy}: PROJ lacks the grid{'' if alone else 's'} {named}, with which they are good to "
             f"{self.better_m:g} m; get {'it' if alone else 'them'} by `{sync}`, or set PROJ_NETWORK=ON"
         )
 

@@ -121,8 +121,8 @@ def warp(
                 cv2.warpPerspective(image, source, size, block, flags=interpolation | cv2.WARP_INVERSE_MAP)
             else:
                 picture = image.shape[1], image.shape[0]
-                seen = source_pixels(pixel_to_crs, grid, column, row, size, picture, to_place, lens)
-                columns, rows = cv2.split(np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32))
+                source_xy = source_pixels(pixel_to_crs, grid, column, row, size, picture, to_place, lens)
+                columns, rows = cv2.split(np.nan_to_num(source_xy - 0.5, nan=-9.0).astype(np.float32))
                 block[...] = cv2.remap(image, columns, rows, interpolation)
     return drawn
 
@@ -171,8 +171,8 @@ def _between(nodes: FloatArray) -> FloatArray:
     return (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4.0
 
 
-def _is_near(found: FloatArray, exact: FloatArray, near: AnyArray) -> bool:
-    return bool(np.abs(found - exact)[near].max(initial=0.0) < _NODE_ERROR_PX)
+def _is_near(estimate: FloatArray, exact: FloatArray, near: AnyArray) -> bool:
+    return bool(np.abs(estimate - exact)[near].max(initial=0.0) < _NODE_ERROR_PX)
 
 
 def _resize(nodes: FloatArray, step: int, size: tuple[int, int]) -> FloatArray:

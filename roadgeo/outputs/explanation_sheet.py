@@ -149,8 +149,8 @@ def _draw_places(places: Sequence[Told], scene: Scene, index: ReferenceIndex) ->
     columns = min(max(len(places), 2), 3)
     side = (_PLACES - (columns - 1) * _MARGIN) // columns
     drawn = [
-        below(_draw_place(told.place, scene, index, side), *_caption(number, told, side), width=side)
-        for number, told in enumerate(places, 1)
+        below(_draw_place(entry.place, scene, index, side), *_caption(number, entry, side), width=side)
+        for number, entry in enumerate(places, 1)
     ]
     rows = [beside(*drawn[k : k + columns], gap=_MARGIN) for k in range(0, len(drawn), columns)]
     return [below(*rows, blank(0, 0), gap=20)]
@@ -181,11 +181,11 @@ def _strokes(scene: Scene, place: Place, chosen: AnyArray) -> FloatArray:
     return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
-def _caption(number: int, told: Told, side: int) -> list[AnyArray]:
-    place, (lon, lat) = told.place, told.place.lonlat.tolist()
+def _caption(number: int, entry: Told, side: int) -> list[AnyArray]:
+    place, (lon, lat) = entry.place, entry.place.lonlat.tolist()
     score = f"score {round(place.score, 1) + 0.0:.1f}" if math.isfinite(place.score) else "no fit"
     where = f"{format_lonlat(lon, lat)}   ·   {place.gsd_m:.2f} m/px"
-    why = [line(text, 15) for text in textwrap.wrap(told.why, side // 8)[:3]]
+    why = [line(text, 15) for text in textwrap.wrap(entry.why, side // 8)[:3]]
     return [line(f"{number}   {score}", 19, bold=True), line(where, 15, FAINT), *why]
 
 

@@ -111,13 +111,13 @@ def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
         bands = bands[:3] if len(bands) >= 3 else bands[:1]
         averaged = Resampling.average if palette is None else Resampling.nearest
         values = picture.read(bands, out_shape=(len(bands), height, width), resampling=averaged)
-        known = picture.dataset_mask(out_shape=(height, width))
+        valid = picture.dataset_mask(out_shape=(height, width))
     colors = np.moveaxis(values, 0, 2) if palette is None else palette[values[0]]
     if colors.dtype != np.uint8:
-        low, high = np.nanpercentile(colors[known > 0], (1, 99)) if known.any() else (0.0, 1.0)
+        low, high = np.nanpercentile(colors[valid > 0], (1, 99)) if valid.any() else (0.0, 1.0)
         colors = np.clip((np.nan_to_num(colors.astype(float)) - low) * (255.0 / max(high - low, 1e-9)), 0, 255)
     preview = np.empty((height, width, 4), np.uint8)
-    preview[..., :3], preview[..., 3] = colors, known
+    preview[..., :3], preview[..., 3] = colors, valid
     return preview
 
 
@@ -287,12 +287,12 @@ class _Plan:
         """Whether the result has an alpha band, else a nodata value."""
         return self.dtype in (np.dtype("uint8"), np.dtype("uint16"))
 
-    def known(self, window: Window, shape: tuple[int, int]) -> BoolArray | None:
+    def valid(self, window: Window, shape: tuple[int, int]) -> BoolArray | None:
         """Return where the picture knows its values in a window, read as (rows, columns); None: everywhere."""
         if all(MaskFlags.all_valid in flags for flags in self.picture.mask_flag_enums):
             return None
-        known = self.picture.dataset_mask(window=window, out_shape=shape, resampling=Resampling.nearest) > 0
-        return None if known.all() else np.asarray(known, bool)
+        valid = self.picture.dataset_mask(window=window, out_shape=shape, resampling=Resampling.nearest) > 0
+        return None if valid.all() else np.asarray(valid, bool)
 
     @property
     def nodata(self) -> float | None:
@@ -411,7 +411,7 @@ class _Part(NamedTuple):
 
     window: Window
     values: AnyArray
-    known: BoolArray | None
+    valid: BoolArray | None
 
 
 def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Part:
@@ -423,17 +423,17 @@ def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Part:
     plan.picture.read(plan.bands, window=window, out=np.moveaxis(values, 2, 0), resampling=averaged)
     if palette is not None:
         values = palette[values[..., 0]]
-    return _Part(window, values, plan.known(window, shape[:2]))
+    return _Part(window, values, plan.valid(window, shape[:2]))
 
 
 def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: AnyArray) -> AnyArray:
-    window, values, known = part
+    window, values, valid = part
     across, along = values.shape[1] / window.width, values.shape[0] / window.height
     from_center = [[across, 0.0, -across * window.col_off - 0.5], [0.0, along, -along * window.row_off - 0.5]]
     maps = cv2.transform(pixels, np.array(from_center)).astype(np.float32)
-    image = _sample(values, maps, known, plan)
-    if known is not None:
-        inside = cv2.min(inside, _remap(_SEEN * known.view(np.uint8)[..., None], maps, cv2.INTER_NEAREST))
+    image = _sample(values, maps, valid, plan)
+    if valid is not None:
+        inside = cv2.min(inside, _remap(_SEEN * valid.view(np.uint8)[..., None], maps, cv2.INTER_NEAREST))
     image[inside == 0] = plan.nodata or 0
     return cv2.merge((image, inside * plan.dtype.type(np.iinfo(plan.dtype).max // _SEEN))) if plan.has_alpha else image
 
@@ -452,14 +452,14 @@ def _reduced_shape(plan: _Plan, window: Window) -> tuple[int, int, int]:
     return max(round(window.height / factor), 1), max(round(window.width / factor), 1), len(plan.bands)
 
 
-def _sample(values: AnyArray, maps: AnyArray, known: BoolArray | None, plan: _Plan) -> AnyArray:
+def _sample(values: AnyArray, maps: AnyArray, valid: BoolArray | None, plan: _Plan) -> AnyArray:
     """Interpolate (rows, columns, bands); unknown pixels have no weight, so that they do not bleed into others."""
     drawable = values if values.dtype in _DRAWABLE else values.astype(np.float64)
-    if known is None or plan.interpolation == cv2.INTER_NEAREST:
+    if valid is None or plan.interpolation == cv2.INTER_NEAREST:
         return _cast(_remap(drawable, maps, plan.interpolation), plan.dtype)
-    known = known[..., None]
-    weights = _remap(known.astype(np.float32), maps, plan.interpolation)
-    weighted = _remap(np.where(known, drawable, 0).astype(np.float32), maps, plan.interpolation)
+    valid = valid[..., None]
+    weights = _remap(valid.astype(np.float32), maps, plan.interpolation)
+    weighted = _remap(np.where(valid, drawable, 0).astype(np.float32), maps, plan.interpolation)
     return _cast(weighted / np.maximum(weights, 1e-3), plan.dtype)
 
 

@@ -131,12 +131,12 @@ def draw_vectorized(
         paler = ground.copy()
         paler[..., 3] = (paler[..., 3] * (1.0 - _PALER)).astype(np.uint8)
         canvas.draw([drawn.Layer("picture", "", [Picture(paler, box)])])
-    seen = mask_picture(mask, _GREY if ground is None else _SEEN, _MAX_SIDE)
+    picture = mask_picture(mask, _GREY if ground is None else _SEEN, _MAX_SIDE)
     if ground is not None:
-        seen[..., 3] //= 3
+        picture[..., 3] //= 3
     canvas.draw(
         [
-            drawn.Layer("picture", "", [Picture(seen, box)]),
+            drawn.Layer("picture", "", [Picture(picture, box)]),
             drawn.Layer("query-roads", "", [Lines([plane_to_pixel(line) for line in graph.polylines()])]),
             drawn.Layer("branches", "", [Lines([plane_to_pixel(ray) for ray in rays])]),
             drawn.Layer("matches", "", [Dots(plane_to_pixel(intersections.xy))]),

@@ -38,8 +38,8 @@ def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
 
 def _cell(document: Mapping[str, Any], name: str) -> Any:
     parts = (document, document.get("displacement") or {}, document.get("center") or {})
-    found = next((part[name] for part in parts if part.get(name) is not None), "")
-    return table_cell(found) if isinstance(found, str) else found
+    value = next((part[name] for part in parts if part.get(name) is not None), "")
+    return table_cell(value) if isinstance(value, str) else value
 
 
 def write_points(path: Path, place: Georeference) -> None:

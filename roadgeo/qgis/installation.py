@@ -168,12 +168,12 @@ def find_profiles(name_or_folder: str) -> list[Path]:
     if Path(name_or_folder).is_dir() or Path(name_or_folder).name != name_or_folder:
         return [Path(name_or_folder)]
     roots = _profile_roots()
-    found = [root / name_or_folder for root in roots if (root / name_or_folder).is_dir()]
-    if found or name_or_folder == "default":
-        return found or [roots[0] / name_or_folder]
-    known = sorted({profile.name for root in roots if root.is_dir() for profile in root.iterdir() if profile.is_dir()})
+    folders = [root / name_or_folder for root in roots if (root / name_or_folder).is_dir()]
+    if folders or name_or_folder == "default":
+        return folders or [roots[0] / name_or_folder]
+    names = sorted({profile.name for root in roots if root.is_dir() for profile in root.iterdir() if profile.is_dir()})
     raise OutputError(
-        f"QGIS has no profile {name_or_folder!r}; it has {', '.join(known) or 'none'}; or give its folder"
+        f"QGIS has no profile {name_or_folder!r}; it has {', '.join(names) or 'none'}; or give its folder"
     )
 
 

@@ -258,19 +258,19 @@ def _keep(
 def identities(path: str | os.PathLike[str]) -> Identities:
     """Return an identity of each file of a reference, which changes when it is replaced; None for a missing file."""
     paths = reference_paths(path)
-    found: Identities = []
+    listed: Identities = []
     for path in (paths.geopackage, paths.index):
         try:
             status = path.stat()
-            found.append((status.st_ino, status.st_mtime_ns))
+            listed.append((status.st_ino, status.st_mtime_ns))
         except FileNotFoundError:
-            found.append(None)
-    return found
+            listed.append(None)
+    return listed
 
 
 def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
     """Describe a network and its index for people, in plain values."""
-    found, graph = network.intersections, network.graph
+    detected, graph = network.intersections, network.graph
     area_km2 = sum(map(polygon_area, network.coverage)) / 1e6
     low, high = (graph.coords.min(axis=0), graph.coords.max(axis=0)) if graph.n_edges else (np.zeros(2), np.zeros(2))
     return {
@@ -278,22 +278,22 @@ def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
         "network": network_digest(network),
         "crs": network.plane.crs,
         "extent": network.plane.to_crs(np.concatenate([[low], [high]])).ravel().tolist(),
-        "counts": {"intersections": len(found), "roads": graph.n_edges, "nodes": graph.n_nodes},
+        "counts": {"intersections": len(detected), "roads": graph.n_edges, "nodes": graph.n_nodes},
         "road_km": float(graph.edge_lengths().sum()) / 1e3,
         "area_km2": area_km2,
-        "intersections_per_km2": len(found) / area_km2 if area_km2 else None,
-        "tuple_types": _count_tuple_types(found, TUPLE_DISTANCE_M),
+        "intersections_per_km2": len(detected) / area_km2 if area_km2 else None,
+        "tuple_types": _count_tuple_types(detected, TUPLE_DISTANCE_M),
         "index": {key: value for key, value in meta.items() if key not in network.meta},
         "meta": network.meta,
     }
 
 
-def _count_tuple_types(found: Intersections, d_max: float) -> dict[str, Any]:
+def _count_tuple_types(detected: Intersections, d_max: float) -> dict[str, Any]:
     """Count pairs of intersections within `d_max` (eq. 8) by branch descriptor d_b, the commonest first (Figure 7)."""
     from scipy.spatial import KDTree
 
-    types, member = np.unique(np.column_stack([found.n_branches, found.n_tangents]), axis=0, return_inverse=True)
-    trees = [KDTree(found.xy[member.ravel() == i]) for i in range(len(types))]
+    types, member = np.unique(np.column_stack([detected.n_branches, detected.n_tangents]), axis=0, return_inverse=True)
+    trees = [KDTree(detected.xy[member.ravel() == i]) for i in range(len(types))]
     counts = []
     for i, (b1, q1) in enumerate(types.tolist()):
         for j, (b2, q2) in enumerate(types[: i + 1].tolist()):

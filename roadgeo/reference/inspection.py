@@ -154,8 +154,8 @@ def _check_whole(path: str | os.PathLike[str]) -> Iterator[str]:
         except (IndexFormatError, RoadSourceError, CrsError) as error:
             yield _named(error, paths.geopackage)
     if has_index:
-        found = check_index(paths.index)
-        yield from found or _check_content(paths.index, network, expected)
+        problems = check_index(paths.index)
+        yield from problems or _check_content(paths.index, network, expected)
 
 
 def _check_geopackage(path: Path) -> Iterator[str]:

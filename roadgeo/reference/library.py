@@ -91,8 +91,8 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
             return manifest.parent
     if Path(name).is_file():
         raise not_a_reference(name)
-    known = [path.stem for path in list_references()]
-    near = difflib.get_close_matches(make_slug(name), known, n=1)
+    names = [path.stem for path in list_references()]
+    near = difflib.get_close_matches(make_slug(name), names, n=1)
     hint = f"did you mean {near[0]}?" if near else "`roadgeo reference list` shows the library, `roadgeo index` adds"
     raise IndexFormatError(f"no reference {name!r}, neither as a file nor in {library_dir()}: {hint}")
 

@@ -205,9 +205,9 @@ def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def network_digest(network: RoadNetwork) -> str:
     """Digest of the content of `intersections`: equal for a network and its GeoPackage, whatever their bytes."""
-    found = network.intersections
+    detected = network.intersections
     hasher = blake2b(digest_size=16)
-    for array in (network.plane.to_crs(found.xy), found.rays, found.tangents, found.residual):
+    for array in (network.plane.to_crs(detected.xy), detected.rays, detected.tangents, detected.residual):
         # Two NaNs, and two zeros, may differ in their bits.
         hasher.update(np.ascontiguousarray(np.where(np.isnan(array), np.nan, array) + 0.0, "<f8").data)
     return hasher.hexdigest()
@@ -248,7 +248,7 @@ def computed_digest(path: str | os.PathLike[str]) -> str:
 
 def _map_layers(network: RoadNetwork) -> list[Layer]:
     """Layers in the order in which they are drawn, the lowest first."""
-    graph, found, plane = network.graph, network.intersections, network.plane
+    graph, detected, plane = network.graph, network.intersections, network.plane
     # Each: name, kind of geometry, geometries, columns, CRS, style, description.
     return [
         Layer(
@@ -274,18 +274,18 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             _ROADS_STYLE,
             "Roads noded at every crossing, as a mask shows them",
         ),
-        _tangent_layer(found, plane),
+        _tangent_layer(detected, plane),
         Layer(
             "intersections",
             "POINT",
-            plane.to_crs(found.xy),
+            plane.to_crs(detected.xy),
             {
-                "branches": found.n_branches,
-                "tangents": found.n_tangents,
-                "residual_m": found.residual.astype(float),
-                "node": found.node,
-                **dict(zip(_RAYS, np.degrees(found.rays.astype(float)).T, strict=True)),
-                **dict(zip(_TANGENTS, np.degrees(found.tangents.astype(float)).T, strict=True)),
+                "branches": detected.n_branches,
+                "tangents": detected.n_tangents,
+                "residual_m": detected.residual.astype(float),
+                "node": detected.node,
+                **dict(zip(_RAYS, np.degrees(detected.rays.astype(float)).T, strict=True)),
+                **dict(zip(_TANGENTS, np.degrees(detected.tangents.astype(float)).T, strict=True)),
             },
             plane.crs,
             seen_from(draw_marker("228,87,46", 1.6), _INTERSECTIONS_FROM),
@@ -296,20 +296,20 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
 
 def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
     """Columns of names and kinds of the streets as far as any are known; text, or NULL."""
-    known = {"name": network.names, "highway": network.kinds}
+    columns = {"name": network.names, "highway": network.kinds}
     return {
         key: [text or None for text in column.tolist()]
-        for key, column in known.items()
+        for key, column in columns.items()
         if column is not None and any(column)
     }
 
 
-def _tangent_layer(found: Intersections, plane: LocalPlane) -> Layer:
+def _tangent_layer(intersections: Intersections, plane: LocalPlane) -> Layer:
     """Draw each tangent as a short line through its intersection."""
-    row, column = np.nonzero(np.isfinite(found.tangents))
-    angle = found.tangents[row, column].astype(float)
+    row, column = np.nonzero(np.isfinite(intersections.tangents))
+    angle = intersections.tangents[row, column].astype(float)
     half = 0.5 * _TANGENT_LINE_M * np.column_stack([np.cos(angle), np.sin(angle)])
-    centre = plane.to_crs(found.xy[row])
+    centre = plane.to_crs(intersections.xy[row])
     return Layer(
         "tangents",
         "LINESTRING",

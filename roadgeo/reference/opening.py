@@ -51,9 +51,9 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
     IndexFormatError
         If there is no such reference, or it is damaged, hostile, stale or of another version.
     """
-    found = resolve_reference(path)
-    manifest = manifest_path(found) if found.is_dir() else None
-    return open_whole(found, say) if manifest is None else open_shards(manifest)
+    resolved = resolve_reference(path)
+    manifest = manifest_path(resolved) if resolved.is_dir() else None
+    return open_whole(resolved, say) if manifest is None else open_shards(manifest)
 
 
 def open_references(names: Iterable[str], say: Say = say_nothing) -> list[AnyReference]:

@@ -127,10 +127,10 @@ _Options = TypeVar("_Options", SimplifyOptions, IntersectionOptions, IndexOption
 
 def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
     """Read the options of one stage out of JSON values, which may hold anything."""
-    told = stored.get(stage, {}) if isinstance(stored, dict) else None
+    fields_stored = stored.get(stage, {}) if isinstance(stored, dict) else None
     values: dict[str, Any] = {}
     for option in fields(kind):
-        value: Any = told.get(option.name, option.default) if isinstance(told, dict) else None
+        value: Any = fields_stored.get(option.name, option.default) if isinstance(fields_stored, dict) else None
         low, high = _RANGES.get(option.name, (0, 1000))
         if type(value) not in {int, type(option.default)} or not low <= value <= high:
             what = f"the stored option {stage}.{option.name} is {value!r}, expected {low:g} to {high:g}"

@@ -195,13 +195,13 @@ def _parse_manifest(document: Any) -> Manifest:
         raise ValueError(f"expected an object of schema {SCHEMA}")
     shards = tuple(ShardEntry.from_dict(values) for values in document.pop("shards"))
     coarse = document.pop("coarse", None)
-    found = Manifest(**document, shards=shards, coarse=None if coarse is None else ShardEntry.from_dict(coarse))
-    texts = (found.name, found.build, found.crs, found.roadgeo)
-    if any(type(text) is not str for text in texts) or not _NAME.fullmatch(found.build):
+    manifest = Manifest(**document, shards=shards, coarse=None if coarse is None else ShardEntry.from_dict(coarse))
+    texts = (manifest.name, manifest.build, manifest.crs, manifest.roadgeo)
+    if any(type(text) is not str for text in texts) or not _NAME.fullmatch(manifest.build):
         raise ValueError("a name is wrong")
-    if type(found.meta) is not dict or not _is_number(found.margin_m) or not found.filled:
+    if type(manifest.meta) is not dict or not _is_number(manifest.margin_m) or not manifest.filled:
         raise ValueError("it has no shards")
-    return found
+    return manifest
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Path:

@@ -52,11 +52,11 @@ def find_border(roads: BoolArray, road_width_px: float) -> BoolArray | None:
     width = max(road_width_px / factor, 1.0)
     on_map = np.ones(small.shape, np.bool_)
     for turns in range(4):  # as seen from each side: a margin's first row is row 0
-        seen = np.rot90(on_map, turns)
-        seen[: _solid_depth(np.rot90(small, turns))] = False
+        side = np.rot90(on_map, turns)
+        side[: _solid_depth(np.rot90(small, turns))] = False
     for turns in range(4):
-        seen = np.rot90(on_map, turns)
-        seen[: _caption_depth(np.rot90(small & on_map, turns), width)] = False
+        side = np.rot90(on_map, turns)
+        side[: _caption_depth(np.rot90(small & on_map, turns), width)] = False
     for turns, line in _find_lines(small & on_map, width):
         _cut(np.rot90(on_map, turns), line)
     if on_map.all() or not (small & on_map).any():
@@ -110,31 +110,31 @@ def _caption_depth(roads: BoolArray, width: float) -> int:
 
 def _find_lines(roads: BoolArray, width: float) -> list[tuple[int, _Line]]:
     """Return the lines of sides, by the quarter turns that bring them to the top; none where too few sides have one."""
-    found: list[tuple[int, _Line]] = []
+    sides: list[tuple[int, _Line]] = []
     for turns in range(4):
         line = _find_line(np.rot90(roads, turns), width)
         if line is not None:
-            found.append((turns, line))
-        elif turns + 1 - len(found) > 4 - _LEAST_SIDES:
+            sides.append((turns, line))
+        elif turns + 1 - len(sides) > 4 - _LEAST_SIDES:
             return []
-    return found
+    return sides
 
 
 def _find_line(roads: BoolArray, width: float) -> _Line | None:
     """Return the innermost line along the first rows that no road crosses, or None."""
     beyond = round(1.5 * width) + 1
     slopes = np.tan(np.radians(np.linspace(-_MAX_TURN_DEG, _MAX_TURN_DEG, 21)))
-    found: list[tuple[float, _Line]] = []
+    candidates: list[tuple[float, _Line]] = []
     covers = _covers(roads, int(_MOST * len(roads)), slopes)
     able = (covers >= _LEAST_LINE).any(axis=1)
     for slope, cover in zip(slopes[able], covers[able], strict=True):
         line = _innermost(cover, beyond)
         if line is not None:
-            found.append((float(cover[line]), _Line(line + 1.0, float(slope))))
-    if not found:
+            candidates.append((float(cover[line]), _Line(line + 1.0, float(slope))))
+    if not candidates:
         return None
-    best = max(cover for cover, _ in found)
-    return max((line for cover, line in found if cover >= 0.97 * best), key=lambda line: line.depth)
+    best = max(cover for cover, _ in candidates)
+    return max((line for cover, line in candidates if cover >= 0.97 * best), key=lambda line: line.depth)
 
 
 def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> FloatArray:

@@ -39,10 +39,10 @@ def _nearest(graph: RoadGraph, lines: AnyArray) -> AnyArray:
     """Return the line nearest to the middle of each road, (E,); -1 where none is near."""
     import shapely
 
-    found = np.full(graph.n_edges, -1, np.int64)
+    nearest = np.full(graph.n_edges, -1, np.int64)
     if graph.n_edges == 0 or len(lines) == 0:
-        return found
+        return nearest
     middles = shapely.line_interpolate_point(graph.lines(), 0.5, normalized=True)
     edge, line = shapely.STRtree(lines).query_nearest(middles, max_distance=_REACH_M, all_matches=False)
-    found[edge] = line
-    return found
+    nearest[edge] = line
+    return nearest

@@ -85,9 +85,9 @@ def build_network(
     graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
     give_back_memory()
     rings = tuple(coverage(graph))
-    found = find_intersections(graph, options.intersections)
+    detected = find_intersections(graph, options.intersections)
     names, kinds = label_roads(graph, np.asarray(lines, object), names, kinds)
-    return as_stored(RoadNetwork(graph, found, plane, rings, {**meta, "options": asdict(options)}, names, kinds))
+    return as_stored(RoadNetwork(graph, detected, plane, rings, {**meta, "options": asdict(options)}, names, kinds))
 
 
 def as_stored(network: RoadNetwork) -> RoadNetwork:

@@ -65,7 +65,7 @@ class Sample:
     ----------
     name : str
         Name of the raster, for messages.
-    seen : (n, B)
+    observed : (n, B)
         Observed pixels spread over the raster.
     channel : int
         The band to go by.
@@ -76,7 +76,7 @@ class Sample:
     """
 
     name: str
-    seen: AnyArray
+    observed: AnyArray
     channel: int
     read_rows: Callable[[], AnyArray]
     options: str = "--band N"
@@ -84,7 +84,7 @@ class Sample:
     @cached_property
     def levels(self) -> AnyArray:
         """The different values of that band, ascending."""
-        values = self.seen[:, self.channel]
+        values = self.observed[:, self.channel]
         ends = np.unique([values.min(), values.max()])
         is_mask = ((values == ends[0]) | (values == ends[-1])).all()
         return ends if is_mask else np.unique(values)
@@ -100,7 +100,7 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     MaskError
         It is a map of several classes.
     """
-    values, levels = sample.seen[:, sample.channel].astype(np.float64), sample.levels.astype(np.float64)
+    values, levels = sample.observed[:, sample.channel].astype(np.float64), sample.levels.astype(np.float64)
     low, high = levels[0], levels[-1]
     if len(levels) <= 2:
         return (float(low + high) / 2 if high > low else float(np.nextafter(high, -np.inf) if high > 0 else high),)
@@ -108,15 +108,15 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
         raise MaskError(
             f"{sample.name}: {len(levels)} values from {low:g} to {high:g}, too alike to part; give a threshold"
         )
-    if sample.seen.dtype.kind in "iu" and high <= _MAX_CLASS and not _is_dark_photograph(sample, levels):
+    if sample.observed.dtype.kind in "iu" and high <= _MAX_CLASS and not _is_dark_photograph(sample, levels):
         _refuse_classes(sample, levels)
         return _spread(values, _otsu(values))
     _refuse_colours(sample, levels)
-    if sample.seen.dtype.kind == "f" and low >= 0 and high <= 1:
+    if sample.observed.dtype.kind == "f" and low >= 0 and high <= 1:
         _refuse_reflectances(sample, values)
         return _spread(values, 0.5 if high > 0.5 else _otsu(values))  # probabilities
     grey = _grey_share(sample, values)
-    usual = 127.0 if sample.seen.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
+    usual = 127.0 if sample.observed.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
     return (usual,) if grey <= _CRISP_SHARE else _spread(values, usual)
 
 
@@ -138,7 +138,7 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
     told : str
         "" where there is nothing to report.
     """
-    values, levels = sample.seen[:, sample.channel], sample.levels
+    values, levels = sample.observed[:, sample.channel], sample.levels
     others = levels[(levels < 0) | (levels > _MAX_CLASS)]
     classes = levels[(levels >= 0) & (levels <= _MAX_CLASS)]
     if len(others) != 1 or len(classes) < 2 or len(levels) < 3 or np.any(levels != np.round(levels)):
@@ -151,8 +151,8 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
         return None, f"holds the values {listed}: {other:g} is taken for road"
     if are_two:
         return other, f"holds the values {listed}: 1 is taken for road, {other:g} for not observed"
-    if other > 0 and sample.seen.dtype.kind in "iu":
-        _refuse_classes(replace(sample, seen=sample.seen[values != other]), classes)
+    if other > 0 and sample.observed.dtype.kind in "iu":
+        _refuse_classes(replace(sample, observed=sample.observed[values != other]), classes)
     return None, ""
 
 
@@ -166,7 +166,7 @@ def find_numbered(sample: Sample) -> float | None:
     """Return the threshold of a mask whose roads have numbers, such as instances, lanes, speeds or years; else None."""
     levels = sample.levels
     is_plain = len(levels) > 2 and levels[0] == 0 and not np.any(levels != np.round(levels)) and not are_labels(levels)
-    if not is_plain or (sample.seen.shape[1] > 1 and np.ptp(sample.seen, axis=1).any()):
+    if not is_plain or (sample.observed.shape[1] > 1 and np.ptp(sample.observed, axis=1).any()):
         return None
     rows = sample.read_rows()
     return float(levels[1]) / 2 if are_patches(rows, rows > 0) and are_roads(rows > 0) else None
@@ -187,7 +187,7 @@ def are_patches(values: AnyArray, shown: BoolArray) -> bool:
 
 def ground_and_road(sample: Sample, threshold: float) -> tuple[float, float]:
     """Return the usual values below and above a threshold that parts them."""
-    return _medians(sample.seen[:, sample.channel].astype(np.float64), threshold)
+    return _medians(sample.observed[:, sample.channel].astype(np.float64), threshold)
 
 
 def _medians(values: AnyArray, threshold: float) -> tuple[float, float]:
@@ -241,10 +241,10 @@ def _is_dark_photograph(sample: Sample, levels: AnyArray) -> bool:
 
 def _refuse_colours(sample: Sample, levels: AnyArray) -> None:
     """Raise where values are a handful of colours: a land cover map."""
-    seen = sample.seen
-    if seen.shape[1] == 1 or np.ptp(seen.astype(np.float64), axis=1).max() <= 0.1 * levels[-1]:
+    colours = sample.observed
+    if colours.shape[1] == 1 or np.ptp(colours.astype(np.float64), axis=1).max() <= 0.1 * levels[-1]:
         return
-    n_colours = len(np.unique(seen, axis=0)) if len(levels) <= _MAX_CLASS else 0
+    n_colours = len(np.unique(colours, axis=0)) if len(levels) <= _MAX_CLASS else 0
     if 2 < n_colours <= _MAX_CLASS:
         raise MaskError(
             f"{sample.name}: holds {n_colours} colours; expected road and no road: choose a band or give a mask"
@@ -256,20 +256,20 @@ def refuse_different_bands(sample: Sample) -> None:
 
     A photograph is left alone: it has three bands, none of which is crisp, and which do not add up to one value.
     """
-    seen = sample.seen.astype(np.float64)
-    span = np.ptp(seen, axis=0)
-    shown = span > (_FAINT * span.max() if seen.shape[1] > 2 else 0.0)  # colours may have traces of others
+    values = sample.observed.astype(np.float64)
+    span = np.ptp(values, axis=0)
+    shown = span > (_FAINT * span.max() if values.shape[1] > 2 else 0.0)  # colours may have traces of others
     if np.count_nonzero(shown) < 2:
         return
-    shares = (seen - seen.min(axis=0))[:, shown] / span[shown]
+    shares = (values - values.min(axis=0))[:, shown] / span[shown]
     is_crisp = (np.minimum(shares, 1.0 - shares) < _CRISP_SHARE).mean(axis=0) > 1.0 - _CRISP_SHARE
-    if shares.shape[1] > 2 and not is_crisp.any() and seen.sum(axis=1).std() > _FAINT * seen.std(axis=0).sum():
+    if shares.shape[1] > 2 and not is_crisp.any() and values.sum(axis=1).std() > _FAINT * values.std(axis=0).sum():
         return
     first = shares[:, np.argmax(is_crisp)]
     roads = min(np.mean(first > 0.5), np.mean(first <= 0.5))
     apart = [min(np.mean(np.abs(band - like) > _FAR) for like in (first, 1.0 - first)) for band in shares.T]
     if max(apart) > _MOST_APART * roads:
-        if seen.shape[1] == 3 and len(sample.levels) > 2:
+        if values.shape[1] == 3 and len(sample.levels) > 2:
             _refuse_colours(sample, sample.levels)
         raise _several_bands(sample)
 
@@ -279,16 +279,16 @@ def _refuse_reflectances(sample: Sample, values: AnyArray) -> None:
 
     Colours are light and dark together, classes shut each other out.
     """
-    seen = sample.seen[:, np.ptp(sample.seen, axis=0) > 0].astype(np.float64)
-    if seen.shape[1] < 2 or np.mean(np.ptp(seen, axis=1) > 0.05 * np.ptp(values)) <= _COLOURED_SHARE:
+    bands = sample.observed[:, np.ptp(sample.observed, axis=0) > 0].astype(np.float64)
+    if bands.shape[1] < 2 or np.mean(np.ptp(bands, axis=1) > 0.05 * np.ptp(values)) <= _COLOURED_SHARE:
         return
-    if np.corrcoef(seen.T).min() > _MIN_CORRELATION:
+    if np.corrcoef(bands.T).min() > _MIN_CORRELATION:
         _grey_share(sample, values)
     raise _several_bands(sample)
 
 
 def _several_bands(sample: Sample) -> MaskError:
-    what = f"{sample.name}: holds {sample.seen.shape[1]} bands that differ"
+    what = f"{sample.name}: holds {sample.observed.shape[1]} bands that differ"
     return MaskError(f"{what}; choose the one that holds the roads: {sample.options}")
 
 
@@ -301,7 +301,7 @@ def _grey_share(sample: Sample, values: AnyArray) -> float:
         They are coloured, or what is light does not look like roads.
     """
     span = np.ptp(values)
-    bands = sample.seen.astype(np.float64)
+    bands = sample.observed.astype(np.float64)
     coloured = np.mean(np.ptp(bands, axis=1) > 0.05 * span) if bands.shape[1] > 1 else 0.0
     counts, edges = np.histogram(values, bins=64)
     dark, light = edges[np.argmax(counts[:32])], edges[32 + np.argmax(counts[32:])]

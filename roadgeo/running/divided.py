@@ -208,13 +208,13 @@ class _Searcher:
         """Search parts together."""
         query, names, options = asked.query, asked.names, asked.options
         parts = [self.parts[name] for name in names]
-        found = search_references(query, parts, options, options.search.time_limit_s)
-        found = [result.less_likely(asked.against) for result in found]
+        searched = search_references(query, parts, options, options.search.time_limit_s)
+        searched = [result.less_likely(asked.against) for result in searched]
         least = options.min_log10_odds - _BELOW
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
-        strong = [place for result in found for place in result.compared if place.score >= least]
+        strong = [place for result in searched for place in result.compared if place.score >= least]
         places = [(place.score, by_path[_path(place.index)]) for place in strong]
-        return _Answer(decide(query, found, options), places, names)
+        return _Answer(decide(query, searched, options), places, names)
 
 
 def _path(part: Any) -> str:

@@ -299,10 +299,10 @@ def _on_ground(location: Location, dem: str) -> Location:
     from roadgeo.sources.elevation import ground_heights
 
     heights = ground_heights(dem, place.to_crs(Frame(*place.size).grid(7, 0.05)), place.crs)
-    known = heights[np.isfinite(heights)]
-    if not len(known):
+    finite = heights[np.isfinite(heights)]
+    if not len(finite):
         return location
-    placed = replace(place, ground_m=(float(known.mean()), float(known.std())))
+    placed = replace(place, ground_m=(float(finite.mean()), float(finite.std())))
     return replace(location, places=(placed, *location.places[1:]))
 
 

@@ -79,12 +79,12 @@ def pixels_of(picture: Any) -> dict[str, Any]:
     rest = [name for name in picture.dims if name not in (rows, columns)]
     labels = picture.coords[rest[0]].values if len(rest) == 1 and rest[0] in picture.coords else ()
     labels = named if isinstance(named := picture.attrs.get("long_name"), tuple | list) else labels
-    known: dict[str, Any] = {"names": tuple(label for label in labels if isinstance(label, str))}
+    labelled: dict[str, Any] = {"names": tuple(label for label in labels if isinstance(label, str))}
     if rows is None or columns is None or not {rows, columns} <= set(picture.coords):
-        return known
+        return labelled
     x, y = (np.asarray(picture.coords[name].values, float) for name in (columns, rows))
     if min(len(x), len(y)) < 2 or not np.isfinite([*x[[0, -1]], *y[[0, -1]]]).all() or x[0] == x[-1] or y[0] == y[-1]:
-        return known
+        return labelled
     wide, high = (x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)
     place = np.array([[wide, 0.0, x[0] - wide / 2], [0.0, high, y[0] - high / 2], [0.0, 0.0, 1.0]])
     crs = str(getattr(picture.coords.get("spatial_ref"), "attrs", {}).get("crs_wkt") or "")
@@ -92,7 +92,7 @@ def pixels_of(picture: Any) -> dict[str, Any]:
     aspect, is_mirrored = stretch_of(wide, high), wide * high > 0.0 and (y[0], high) not in ((0.0, 1.0), (0.5, 1.0))
     if named_crs is not None:
         aspect, is_mirrored = Georeference(place, named_crs, (len(x), len(y)), "geotransform").pixel_shape()
-    return {**known, "aspect": aspect, "mirror": bool(is_mirrored)}
+    return {**labelled, "aspect": aspect, "mirror": bool(is_mirrored)}
 
 
 def _axis(data: Any, names: set[str]) -> Any:

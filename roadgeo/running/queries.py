@@ -209,9 +209,9 @@ def _locate_lines(
     if drawing.middle is not None and swapped_near((*drawing.middle, 1000.0), references) is not None:
         _LOG.warning("%s: its coordinates lie on none of the maps; %s", visible(path), EXCHANGED)
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
-        known = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
+        scale = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
         tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map
-        camera = replace(camera, gsd_m=known, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
+        camera = replace(camera, gsd_m=scale, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
     options = replace(options, match=replace(options.match, camera=camera))
     sighting = locate_passes([drawing.mask], lambda mask: PassRoads("its lines", mask), references, options, how)
     return sighting.showing(lines_to_pixels=drawing.to_pixel)

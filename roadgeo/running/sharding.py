@@ -254,8 +254,8 @@ def _to(lines: RoadLines, crs: str) -> Any:
 
 def _metres(crs: str) -> float | None:
     """Return the metres of a unit of a CRS; None for degrees."""
-    known = known_crs(crs)
-    return float(known.axis_info[0].unit_conversion_factor) if known.is_projected else None
+    resolved = known_crs(crs)
+    return float(resolved.axis_info[0].unit_conversion_factor) if resolved.is_projected else None
 
 
 def _coarse_box(boxes: Sequence[ShardBox]) -> ShardBox:

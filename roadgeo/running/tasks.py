@@ -78,16 +78,16 @@ def find_masks(arguments: Sequence[str], recursive: bool = False, suffixes: tupl
     Numbers in names count as numbers: frame_2 comes before frame_10. Images in folders within folders are found with
     `recursive`; else a message mentions them. Another mentions what is passed over: other formats, videos.
     """
-    found: list[str] = []
+    masks: list[str] = []
     for argument in arguments:
         if Path(argument).is_dir():
-            found += _images_in(Path(argument), recursive, suffixes)
+            masks += _images_in(Path(argument), recursive, suffixes)
         elif glob.has_magic(argument) and not Path(argument).exists():
             names = glob.glob(argument, recursive=True)  # noqa: PTH207 (patterns may be absolute)
-            found += _in_order(names) or [argument]
+            masks += _in_order(names) or [argument]
         else:
-            found.append(argument)
-    return found
+            masks.append(argument)
+    return masks
 
 
 def in_natural_order(name: str, decimals: bool = True) -> list[str | tuple[int, str]]:
@@ -102,16 +102,16 @@ def in_natural_order(name: str, decimals: bool = True) -> list[str | tuple[int, 
 
 def _in_order(names: Iterable[str]) -> list[str]:
     """Sort names, and print a line where decimals in them may mean something else."""
-    found = sorted(names, key=in_natural_order)
-    whole = sorted(found, key=partial(in_natural_order, decimals=False))
-    if found != whole:
-        first = next(k for k, (one, other) in enumerate(zip(found, whole, strict=True)) if one != other)
+    ordered = sorted(names, key=in_natural_order)
+    whole = sorted(ordered, key=partial(in_natural_order, decimals=False))
+    if ordered != whole:
+        first = next(k for k, (one, other) in enumerate(zip(ordered, whole, strict=True)) if one != other)
         _LOG.warning(
             "numbers in names are read as decimals: %s comes before %s; where digits after the point are whole numbers "
             "(of nanoseconds, say), give them as many digits each",
-            *(visible(Path(name).name) for name in (found[first], whole[first])),
+            *(visible(Path(name).name) for name in (ordered[first], whole[first])),
         )
-    return found
+    return ordered
 
 
 def _images_in(folder: Path, recursive: bool, suffixes: tuple[str, ...]) -> list[str]:
@@ -137,11 +137,11 @@ def _images_in(folder: Path, recursive: bool, suffixes: tuple[str, ...]) -> list
 
 def _walk(folder: Path) -> list[str]:
     """Return all files of a folder and of those within it, but for hidden ones."""
-    found = []
+    paths = []
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        found += [str(Path(root, name)) for name in names]
-    return _in_order(found)
+        paths += [str(Path(root, name)) for name in names]
+    return _in_order(paths)
 
 
 def _suffix(name: str) -> str:
@@ -168,15 +168,15 @@ def name_tasks(masks: Sequence[str], out_dir: str | os.PathLike[str] | None = No
 
     So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
     """
-    known = [_stems(mask, n) for n, mask in enumerate(masks)]
+    choices = [_stems(mask, n) for n, mask in enumerate(masks)]
     used = [0] * len(masks)
     while True:
-        stems = [stems[level] for stems, level in zip(known, used, strict=True)]
+        stems = [stems[level] for stems, level in zip(choices, used, strict=True)]
         taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that ignore case
         shared = [
             n
             for n, stem in enumerate(stems)
-            if used[n] < len(known[n]) - 1 and (taken[stem.casefold()] > 1 or _is_anothers(out_dir, stem, masks[n]))
+            if used[n] < len(choices[n]) - 1 and (taken[stem.casefold()] > 1 or _is_anothers(out_dir, stem, masks[n]))
         ]
         if not shared:
             return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]

@@ -114,9 +114,9 @@ def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
         answer = how(variant.mask, references, options)
         if variant.mask is mask:
             return answer
-        found = answer.location if isinstance(answer, Explanation) else answer
-        found = _stating_pixels(in_pixels_of(found, mask.shape[::-1], variant.matrix), aspect)
-        return replace(answer, location=found) if isinstance(answer, Explanation) else found
+        place = answer.location if isinstance(answer, Explanation) else answer
+        place = _stating_pixels(in_pixels_of(place, mask.shape[::-1], variant.matrix), aspect)
+        return replace(answer, location=place) if isinstance(answer, Explanation) else place
 
     return locate
 

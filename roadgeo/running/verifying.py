@@ -83,8 +83,8 @@ def verify_image(image: str, references: Sequence[AnyReference], settings: Verif
         if place is None:
             return Verified(_document(image, Checked("unknown", "it has no georeference: use `roadgeo locate`")))
         pieces = [Reference(index) for reference in references for index in reference.indexes_at([place.middle()])]
-        found = _best(_Image(image, place, settings), pieces)
-        return replace(found, document={**found.document, "seconds": round(perf_counter() - started, 3)})
+        verified = _best(_Image(image, place, settings), pieces)
+        return replace(verified, document={**verified.document, "seconds": round(perf_counter() - started, 3)})
     except RoadgeoError as error:
         return _failed(image, str(error))
 
@@ -108,26 +108,26 @@ def _best(image: _Image, references: Sequence[Reference]) -> Verified:
         )
     start = image.place.on_plane(reference.index.plane)
     checked = _allow_for_crs(_look(image, reference, start), image, reference)
-    found = checked.displacement
-    if found is None or checked.verdict != "off":
+    offset = checked.displacement
+    if offset is None or checked.verdict != "off":
         return Verified(_document(image.name, checked, image.place, reference))
-    corrected = image.place.moved(found.matrix @ start, reference.index.plane)
+    corrected = image.place.moved(offset.matrix @ start, reference.index.plane)
     return Verified(_document(image.name, checked, image.place, reference, corrected), corrected)
 
 
 def _inexact(place: Georeference, reference: Reference) -> float:
     """Return how exactly PROJ takes an image's CRS to a map's, metres; 0 where it does not know."""
-    found = exactness(place.crs, reference.index.plane.crs, place.middle()).sigma_m
-    return 0.0 if math.isnan(found) else found
+    stated_m = exactness(place.crs, reference.index.plane.crs, place.middle()).sigma_m
+    return 0.0 if math.isnan(stated_m) else stated_m
 
 
 def _allow_for_crs(checked: Checked, image: _Image, reference: Reference) -> Checked:
     """Judge nothing to be off that may be due to the transformation from an image's CRS to the map's."""
-    inexact, found = _inexact(image.place, reference), checked.displacement
-    if checked.verdict != "off" or found is None or inexact == 0.0:
+    inexact, offset = _inexact(image.place, reference), checked.displacement
+    if checked.verdict != "off" or offset is None or inexact == 0.0:
         return checked
     corners = _frame_of(image.place, reference)
-    if found.over(corners) - math.hypot(found.sigma_over(corners), inexact) > image.settings.options.tolerance_m:
+    if offset.over(corners) - math.hypot(offset.sigma_over(corners), inexact) > image.settings.options.tolerance_m:
         return checked
     crs = image.place.crs if len(image.place.crs) < 20 else "the image's CRS"
     reason = f"{checked.reason}: that may be the way from {crs} to the map's, which PROJ knows to {inexact:g} m only"
@@ -155,8 +155,10 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
         coarser = np.diag([width / mask.shape[1]] * 2 + [1.0])  # large photographs are segmented on a coarser grid
         checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)
         results.append(checked)
-        known = checked.verdict != "unknown"
-        return Location(mask.name, "located" if known else "not_located", checked.reason, spent=Spent(query.seconds))
+        is_decided = checked.verdict != "unknown"
+        return Location(
+            mask.name, "located" if is_decided else "not_located", checked.reason, spent=Spent(query.seconds)
+        )
 
     gsd = math.sqrt(abs(np.linalg.det(Homography(start).jacobian(Frame(*image.place.size).center))))
     options = LocateOptions()
@@ -211,9 +213,11 @@ def _document(
         document["reference"] = reference.name
         document["attribution"] = str(reference.index.meta.get("attribution") or "")
         plane = reference.index.plane
-        known, rival = checked.displacement, checked.rival
-        frame = None if known is None else _frame_of(place, reference)
-        document["displacement"] = None if known is None else _to_dict(known, plane, frame, _inexact(place, reference))
+        offset, rival = checked.displacement, checked.rival
+        frame = None if offset is None else _frame_of(place, reference)
+        document["displacement"] = (
+            None if offset is None else _to_dict(offset, plane, frame, _inexact(place, reference))
+        )
         document["rival"] = None if rival is None else _to_dict(rival, plane, None)
     return document
 
@@ -224,26 +228,26 @@ def _frame_of(place: Georeference, reference: Reference) -> FloatArray:
 
 
 def _to_dict(
-    found: Displacement, plane: LocalPlane, corners: FloatArray | None, inexact: float = 0.0
+    displacement: Displacement, plane: LocalPlane, corners: FloatArray | None, inexact: float = 0.0
 ) -> dict[str, float]:
     """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid.
 
     `inexact`: metres to which the image's CRS is taken to the plane's.
     """
-    turn = math.radians(grid_north(plane, plane.to_crs(found.about)))
-    east = found.east_m * math.cos(turn) + found.north_m * math.sin(turn)
-    north = found.north_m * math.cos(turn) - found.east_m * math.sin(turn)
-    values = {"east_m": east, "north_m": north, "turn_deg": found.turn_deg, "scale": found.scale}
+    turn = math.radians(grid_north(plane, plane.to_crs(displacement.about)))
+    east = displacement.east_m * math.cos(turn) + displacement.north_m * math.sin(turn)
+    north = displacement.north_m * math.cos(turn) - displacement.east_m * math.sin(turn)
+    values = {"east_m": east, "north_m": north, "turn_deg": displacement.turn_deg, "scale": displacement.scale}
     if corners is None:
         return values
-    sigma = np.sqrt(np.diag(found.covariance))
+    sigma = np.sqrt(np.diag(displacement.covariance))
     return {
         **values,
         "sigma_east_m": math.hypot(float(sigma[0]), inexact / math.sqrt(2.0)),
         "sigma_north_m": math.hypot(float(sigma[1]), inexact / math.sqrt(2.0)),
         "sigma_turn_deg": math.degrees(float(sigma[2])),
         "sigma_scale": float(sigma[3]),
-        "off_m": found.over(corners),
-        "sigma_m": math.hypot(found.sigma_over(corners), inexact),
-        "residual_m": found.residual_m,
+        "off_m": displacement.over(corners),
+        "sigma_m": math.hypot(displacement.sigma_over(corners), inexact),
+        "residual_m": displacement.residual_m,
     }

@@ -281,10 +281,10 @@ async def _take(request: Request, folder: Path) -> Job:
             image = form.get("image")
             if not isinstance(image, UploadFile):
                 raise HTTPException(400, "expected a form with a file named image: curl -F image=@photo.jpg")
-            told = read_hints([(key, value) for key, value in form.multi_items() if isinstance(value, str)])
-            if hints.keys() & told.keys():
+            given = read_hints([(key, value) for key, value in form.multi_items() if isinstance(value, str)])
+            if hints.keys() & given.keys():
                 raise HTTPException(400, "a hint stands in the URL and in the form: give it once")
-            hints |= told
+            hints |= given
             name = (image.filename or "").replace("\\", "/")
             with part.open("wb") as file:
                 await asyncio.to_thread(shutil.copyfileobj, image.file, file)

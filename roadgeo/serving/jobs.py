@@ -75,10 +75,10 @@ class Job:
 
     def end(self, answer: Reply) -> None:
         """Keep the answer."""
-        found = answer.status == 200
+        succeeded = answer.status == 200
         self.answer = None if self.is_over else answer
-        message = str(answer.document.get("reason" if found else "detail", ""))
-        self._become("successful" if found else "failed", message, 100)
+        message = str(answer.document.get("reason" if succeeded else "detail", ""))
+        self._become("successful" if succeeded else "failed", message, 100)
 
     def call_off(self) -> None:
         """Have nobody wait for it any more."""

@@ -141,10 +141,10 @@ def _named(path: str, box: FloatArray) -> list[tuple[FloatArray, str]]:
     import shapely
 
     tree, names = _streets(path)
-    found = tree.query(shapely.box(*box.ravel()))
-    lines = shapely.clip_by_rect(tree.geometries[found], *box.ravel())
+    inside = tree.query(shapely.box(*box.ravel()))
+    lines = shapely.clip_by_rect(tree.geometries[inside], *box.ravel())
     parts, owner = shapely.get_parts(lines, return_index=True)
-    pairs = zip(parts, names[found][owner], strict=True)
+    pairs = zip(parts, names[inside][owner], strict=True)
     return [(shapely.get_coordinates(line), str(name)) for line, name in pairs if not shapely.is_empty(line)]
 
 

@@ -146,10 +146,10 @@ def _show_place(folder: Path, shown: Subject) -> dict[str, Any]:
     roads = [line for line in (lay(item) for item in shown.lines) if np.isfinite(line).all()]
     matches, values = shown.largest_residuals(), []
     if matches is not None:
-        seen, there = lay(plane_to_pixel(matches.query_xy)), to_lonlat(place.crs, matches.reference_xy)
+        at_pixels, there = lay(plane_to_pixel(matches.query_xy)), to_lonlat(place.crs, matches.reference_xy)
         values = [
             {"seen": _rounded(a, 7), "map": _rounded(b, 7), "residual_m": round(float(residual), 2)}
-            for a, b, residual in zip(seen, there, matches.residual_m, strict=True)
+            for a, b, residual in zip(at_pixels, there, matches.residual_m, strict=True)
             if np.isfinite([*a, *b]).all()
         ]
     outline = Frame(*shown.mask_size).outline()

@@ -241,18 +241,18 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     taken, options = hints.pop("take", None), apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
-    seen = Path(request.path).parent.with_name(OWN) / SEEN
-    is_known = seen.is_file() and not request.hints.keys() & {"gsd_m", "focal_px"}
+    kept = Path(request.path).parent.with_name(OWN) / SEEN
+    has_probability = kept.is_file() and not request.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
-    image, query = str(seen) if is_known else request.path, ReadOptions(threads=threads)
+    image, query = str(kept) if has_probability else request.path, ReadOptions(threads=threads)
     sighting = None if taken is None else read_sighting(Path(request.path))  # of the answer whose place is taken
     if sighting is None:
         sighting = locate_query(image, references, options, query, how=search, say=tell)
-        sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
+        sighting = replace(sighting, of_photograph=sighting.of_photograph or has_probability)
     if taken is not None:
         sighting = sighting.answering(take_place(sighting.location, taken, options))
     location = replace(sighting.location, query=request.name)
-    location = replace(location, reason=_without(request.path, _without(str(seen), location.reason)))
+    location = replace(location, reason=_without(request.path, _without(str(kept), location.reason)))
     lacks_view = False
     if request.keeps:
         say("drawing the answer")

@@ -165,8 +165,8 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
         values = np.moveaxis(dataset.read(chosen, window=window)[:, ::step, ::step], 0, 2)
         valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > 0
         if nodata is not None and dataset.nodata is None:
-            known = (values != nodata).all(axis=2)
-            valid = known if valid is None else valid & known
+            given = (values != nodata).all(axis=2)
+            valid = given if valid is None else valid & given
         if palette is None:
             return values, valid
         shown = palette[values[..., 0]]
@@ -220,5 +220,5 @@ def _choose(name: str, choice: Choice, labels: Sequence[str]) -> tuple[list[int]
         i for i, text in enumerate(texts) if re.fullmatch(r"[\W\d]*", _ROADS.sub("", text)) and _ROADS.search(text)
     ]
     among = [i for i, text in enumerate(texts) if _ROADS.search(text) and not _OTHERS.search(text)]
-    named = next((found for found in (alone, among) if len(found) == 1), None)
+    named = next((indices for indices in (alone, among) if len(indices) == 1), None)
     return named or list(range(min(len(labels), _MAX_BANDS))), named is not None

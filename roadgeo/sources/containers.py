@@ -144,21 +144,25 @@ def _stream_gdal(
         part = what_is_missing(path, total)
         for skip in range(0, max(total, 1), most):
             more = [column] * (column not in ("", *columns))
-            found = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
-            if found.shapes is None:
+            data = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
+            if data.shapes is None:
                 raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
-            if len(found.shapes) < min(most, total - skip):
+            if len(data.shapes) < min(most, total - skip):
                 raise RoadSourceError(
-                    f"{path}: is cut off: {skip + len(found.shapes):,} of {total:,} features are in it"
+                    f"{path}: is cut off: {skip + len(data.shapes):,} of {total:,} features are in it"
                 )
-            shapes, table = shapely.from_wkb(found.shapes, on_invalid="ignore"), dict(found.columns)
+            shapes, table = shapely.from_wkb(data.shapes, on_invalid="ignore"), dict(data.columns)
             if column:
                 named = table[column.lower()] if column in columns else table.pop(column.lower())
                 rows = np.isin(named.astype(str), levels)
                 shapes, table = shapes[rows], {name: values[rows] for name, values in table.items()}
-            meta = {"format": found.driver, "layer": ", ".join(levels or [one.layer for one in parts]), **found.notes}
+            meta = {
+                "format": data.driver,
+                "layer": ", ".join(levels or [one.layer for one in parts]),
+                **data.notes,
+            }
             meta |= ({"part": part} if part else {}) | ({"levels": hint} if hint and not levels else {})
-            yield RoadTable(shapes, found.crs, table, meta)
+            yield RoadTable(shapes, data.crs, table, meta)
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(parts))
 
 
@@ -197,12 +201,12 @@ def _levels(path: Path, layer: str, areas: bool) -> tuple[str, list[str]]:
     import shapely
 
     column = next((name for name in describe_layer(path, layer)[1] if name.lower() in _LEVELS), "")
-    found = read_layer(path, layer, [column]) if column else None
-    if found is None or found.shapes is None:
+    layer_read = read_layer(path, layer, [column]) if column else None
+    if layer_read is None or layer_read.shapes is None:
         return "", []
-    kinds = shapely.get_type_id(shapely.from_wkb(found.shapes, on_invalid="ignore"))
+    kinds = shapely.get_type_id(shapely.from_wkb(layer_read.shapes, on_invalid="ignore"))
     lines = np.isin(kinds, (1, 2, 5, 7, *((3, 6) if areas else ())))
-    return column, _names_of(found.columns[column.lower()][lines], path)
+    return column, _names_of(layer_read.columns[column.lower()][lines], path)
 
 
 def _names_of(values: AnyArray, path: Path) -> list[str]:
@@ -225,14 +229,14 @@ def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
     The third is which layers of a drawing its rows come from, for people; "" where this is unknown, or from one.
     """
     total, fields = describe_layer(path, layer)
-    known = [name for name in fields if is_known_column(name)]
-    if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
-        return total, known, ""
+    chosen = [name for name in fields if is_known_column(name)]
+    if not fields or {"highway", "fclass"} & {name.lower() for name in chosen}:
+        return total, chosen, ""
     head = read_layer(path, layer, fields, 0, _PEEK).columns
     column = next((name for name in fields if name.lower() in _LEVELS), "")
     levels = _names_of(head.get(column.lower(), np.empty(0, object)), path)
     hint = f"{column}: {_listed(levels)}" if len(levels) > 1 else ""
-    return total, known + [name for name in fields if name not in known and names_kinds(head[name.lower()])], hint
+    return total, chosen + [name for name in fields if name not in chosen and names_kinds(head[name.lower()])], hint
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -270,7 +274,7 @@ def what_is_missing(path: Path, n_features: int) -> str:
         if ending != ".gml":
             file.seek(max(path.stat().st_size - _ENDS_BYTES, 0))
             text += file.read()
-    matched = max((int(found[1]) for found in _MATCHED.finditer(text)), default=0)
+    matched = max((int(match[1]) for match in _MATCHED.finditer(text)), default=0)
     limited = _LIMITED.search(text)
     if matched > n_features:
         return f"says that it is not whole: {n_features:,} of {matched:,} features; fetch the rest"
@@ -327,17 +331,18 @@ def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> t
         column = geo["columns"][geo["primary_column"]]
         return geo["primary_column"], column.get("crs", "EPSG:4326"), str(column.get("encoding"))
     for field in schema:
-        told = field.metadata or {}
-        named = told.get(b"ARROW:extension:name", b"").decode() or getattr(field.type, "extension_name", "")
+        extension = field.metadata or {}
+        named = extension.get(b"ARROW:extension:name", b"").decode() or getattr(field.type, "extension_name", "")
         if named.startswith(("geoarrow.", "ogc.")):
-            return field.name, json.loads(told.get(b"ARROW:extension:metadata") or "{}").get("crs"), named.split(".")[1]
+            about = json.loads(extension.get(b"ARROW:extension:metadata") or "{}")
+            return field.name, about.get("crs"), named.split(".")[1]
     texts = [field.name for field in schema if str(field.type).removeprefix("large_").removesuffix("_view") in _TEXTS]
-    found = next((name for name in texts if name.lower() in _SHAPES), None) or next(
+    shape_column = next((name for name in texts if name.lower() in _SHAPES), None) or next(
         (name for name in texts if _is_shape(first(name))), None
     )
-    if found is None:
+    if shape_column is None:
         raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
-    return found, None, "WKB"
+    return shape_column, None, "WKB"
 
 
 def _is_shape(value: Any) -> bool:
@@ -349,9 +354,9 @@ def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
     """Return shapes of WKB, also in hexadecimal digits, or WKT, of PostGIS too, and the number of their CRS, or 0."""
     import shapely
 
-    known = next((value for value in values if value is not None), b"")
-    if isinstance(known, str) and not _HEX.fullmatch(known[:64]):
-        srid = _SRID.match(known)
+    first = next((value for value in values if value is not None), b"")
+    if isinstance(first, str) and not _HEX.fullmatch(first[:64]):
+        srid = _SRID.match(first)
         texts = [value and _SRID.sub("", value) for value in values]
         return np.asarray(shapely.from_wkt(texts, on_invalid="ignore")), int(srid[1]) if srid else 0
     packed = [bytes(value) if isinstance(value, bytearray | memoryview) else value for value in values]
@@ -529,11 +534,11 @@ def _overpass_elements(path: Path) -> list[Any] | None:
 
 def overpass_table(elements: Sequence[Any]) -> RoadTable:
     """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere; some may be missing."""
-    known = [element for element in elements if isinstance(element, Mapping)]
-    nodes = {node["id"]: node for node in known if node.get("type") == "node" and isinstance(node.get("id"), int)}
+    mappings = [element for element in elements if isinstance(element, Mapping)]
+    nodes = {node["id"]: node for node in mappings if node.get("type") == "node" and isinstance(node.get("id"), int)}
     shapes: list[Any] = []
     tags: list[Mapping[str, Any]] = []
-    for way in known:
+    for way in mappings:
         own = way.get("tags")
         if way.get("type") != "way" or not isinstance(own, Mapping) or "highway" not in own:
             continue

@@ -126,8 +126,8 @@ def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixe
     """Return the units of coordinates by their CRS and size."""
     low, high = coords.min(axis=0), coords.max(axis=0)
     if crs is not None:
-        known = known_crs(crs)
-        if not known.is_geographic:
+        resolved = known_crs(crs)
+        if not resolved.is_geographic:
             return "metres"
         fits = bool((np.abs(low) <= (180, 90)).all() and (np.abs(high) <= (180, 90)).all())
         if fits and (high - low).max() <= _MOST_DEGREES:

@@ -42,6 +42,6 @@ def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> Flo
         there = transform(crs, own, xy)
         inside = np.isfinite(there).all(axis=1)
         values = np.full(len(there), np.nan)
-        for i, found in zip(np.flatnonzero(inside), raster.sample(there[inside], indexes=1, masked=True), strict=True):
-            values[i] = np.ma.filled(found.astype(float), np.nan)[0]
+        for i, height in zip(np.flatnonzero(inside), raster.sample(there[inside], indexes=1, masked=True), strict=True):
+            values[i] = np.ma.filled(height.astype(float), np.nan)[0]
         return values

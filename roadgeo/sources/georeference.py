@@ -45,11 +45,11 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     with open_raster(path) as raster:
         size = (raster.width, raster.height)
         own = _crs_of(raster) if crs is None else name_crs(crs)
-        found = _of_raster(raster)
-    source, matrix = found or ("world file", _of_world_file(Path(path)))
+        stated = _of_raster(raster)
+    source, matrix = stated or ("world file", _of_world_file(Path(path)))
     if matrix is None:
         return None
-    if found is None:  # a world file speaks of pixels as they are stored
+    if stated is None:  # a world file speaks of pixels as they are stored
         matrix = matrix @ stored_from_upright(read_orientation(path), size)
     own = own or _crs_beside(Path(path))
     if own is None:
@@ -66,8 +66,8 @@ def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | No
 
     None where it has neither.
     """
-    found = _stated(path)
-    middle = found.middle() if found is not None else (np.nan, np.nan)
+    georeference = _stated(path)
+    middle = georeference.middle() if georeference is not None else (np.nan, np.nan)
     return middle if np.isfinite(middle).all() else read_position(path)
 
 
@@ -76,13 +76,13 @@ def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:
 
     Without a georeference its resolution counts, as scanners and facsimiles state it.
     """
-    found = _stated(path)
-    if found is None:
+    georeference = _stated(path)
+    if georeference is None:
         across, down = read_resolution(path)
         aspect = stretch_of(down, across)
         turned = read_orientation(path) > _STEPS_ASIDE
         return (1.0 / aspect if aspect and turned else aspect), False
-    return (None, False) if found.source == "control points" else found.pixel_shape()
+    return (None, False) if georeference.source == "control points" else georeference.pixel_shape()
 
 
 def _stated(path: str | os.PathLike[str]) -> Georeference | None:

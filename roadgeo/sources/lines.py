@@ -102,10 +102,10 @@ def line_through(points: FloatArray) -> Any:
     """
     import shapely
 
-    known = np.isfinite(points).all(axis=1)
-    cuts = np.flatnonzero(np.diff(known)) + 1
+    finite = np.isfinite(points).all(axis=1)
+    cuts = np.flatnonzero(np.diff(finite)) + 1
     pieces = [
-        part for part, is_known in zip(np.split(points, cuts), np.split(known, cuts), strict=True) if all(is_known)
+        part for part, is_finite in zip(np.split(points, cuts), np.split(finite, cuts), strict=True) if all(is_finite)
     ]
     lines = [shapely.LineString(piece) for piece in pieces if len(np.unique(piece, axis=0)) > 1]
     return shapely.MultiLineString(lines) if len(lines) > 1 else next(iter(lines), None)
@@ -172,13 +172,13 @@ def cut_lines(lines: AnyArray, area: Any) -> tuple[AnyArray, AnyArray]:
         inside = shapely.covers(ground, lines[near])
         pieces.append(np.where(inside, lines[near], shapely.intersection(lines[near], np.where(inside, None, ground))))
         places.append(near)
-    found, place = simple_lines(np.concatenate(pieces))
-    return found, np.concatenate(places)[place]
+    simple, place = simple_lines(np.concatenate(pieces))
+    return simple, np.concatenate(places)[place]
 
 
 def objects(values: Any) -> AnyArray:
     """Return an (N,) array of any values as they are, such as shapes or texts."""
     listed = list(values)
-    found = np.empty(len(listed), object)
-    found[:] = listed
-    return found
+    array = np.empty(len(listed), object)
+    array[:] = listed
+    return array

@@ -127,7 +127,7 @@ class MaskSource:
         name, is_mask = self._raster.name, self._raster.model_threshold is None
         roads, observed = _separate(self._raster, self._channel, threshold)
         if is_mask:
-            roads, observed = _told_apart(name, roads, observed)
+            roads, observed = _corrected(name, roads, observed)
         if self._voids and is_mask:
             width = road_width(RoadMask(roads, name=name))
             roads, observed = _without_border(name, roads, observed, width)
@@ -187,18 +187,18 @@ def _interpret(raster: Raster, choice: Choice, threshold: float | None, voids: b
     _require_mask(raster)
     if choice.road_class is not None:
         raster = _of_class(raster, choice.road_class)
-    seen, hidden = _sample(raster)
-    plain = _of_colours(_without_fill(raster, seen))
+    observed, hidden = _sample(raster)
+    plain = _of_colours(_without_fill(raster, observed))
     if plain is not raster:
         raster = plain
-        seen, hidden = _sample(raster)
+        observed, hidden = _sample(raster)
     if len(hidden):
-        raster = _drawn(raster, seen, hidden)
-        seen, _ = _sample(raster)
-    if len(seen) == 0:
+        raster = _drawn(raster, observed, hidden)
+        observed, _ = _sample(raster)
+    if len(observed) == 0:
         raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
-    channel = int(np.argmax(seen.std(axis=0)))
-    sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
+    channel = int(np.argmax(observed.std(axis=0)))
+    sample = Sample(raster.name, observed, channel, lambda: _numbers(*_middle(raster), channel), raster.options)
     refuse_different_bands(sample)
     if threshold is None:
         raster, sample = _without_unlabelled(raster, sample)
@@ -208,19 +208,19 @@ def _interpret(raster: Raster, choice: Choice, threshold: float | None, voids: b
     threshold = threshold if number is None else number
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
     levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
-    return MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, seen, channel, choice))
+    return MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, observed, channel, choice))
 
 
-def _part_of(raster: Raster, seen: AnyArray, channel: int, choice: Choice) -> str:
+def _part_of(raster: Raster, observed: AnyArray, channel: int, choice: Choice) -> str:
     """Return which band of (n, B) values is read, and which class, where there are others."""
-    total, are_alike = len(raster.all_bands), not raster.is_chosen and (seen == seen[:, :1]).all()
+    total, are_alike = len(raster.all_bands), not raster.is_chosen and (observed == observed[:, :1]).all()
     band = "" if total < 2 or are_alike else f"band {raster.bands[channel]} of {total}"
     return ", ".join(
         filter(None, [raster.page, band, "" if choice.road_class is None else f"class {choice.road_class}"])
     )
 
 
-def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
+def _drawn(raster: Raster, observed: AnyArray, hidden: AnyArray) -> Raster:
     """Take what shows roads by being there, or by not being there, for roads.
 
     The first are opaque pixels of one dark colour: black roads on transparent ground; or pixels of one value, or of one
@@ -228,23 +228,23 @@ def _drawn(raster: Raster, seen: AnyArray, hidden: AnyArray) -> Raster:
     transparent pixels that look like roads on ground of one value, or in a soft map with values below theirs. (n, B)
     values of a sample were observed, or not.
     """
-    share = len(seen) / (len(seen) + len(hidden))
-    if raster.has_alpha and 0 < share <= _MAX_ROAD_SHARE and not seen.any():
+    share = len(observed) / (len(observed) + len(hidden))
+    if raster.has_alpha and 0 < share <= _MAX_ROAD_SHARE and not observed.any():
         return replace(_where(raster, True), bands=raster.bands[:1])
     middle, valid = _middle(raster)
     shown = ~_finite(middle, valid)
-    is_one = len(seen) > 0 and ((seen == seen[0]).all() or are_patches(middle[..., 0], ~shown))
+    is_one = len(observed) > 0 and ((observed == observed[0]).all() or are_patches(middle[..., 0], ~shown))
     if 0 < share <= _MAX_ROAD_SHARE and is_one and are_roads(~shown):
         _LOG.warning("%s: all that is observed looks like roads: it is taken for them", visible(raster.name))
         return replace(_where(raster, True), bands=raster.bands[:1])
     edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
     if not 1 - _MAX_ROAD_SHARE <= share < 1 or max(edge.mean() for edge in edges) > 0.5 or not are_roads(shown):
         return raster
-    if (seen == seen[0]).all():
+    if (observed == observed[0]).all():
         _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", visible(raster.name))
         return replace(_where(raster, False), bands=raster.bands[:1])
-    is_lightest = seen.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > seen.max()
-    if not is_lightest or len(np.unique(seen)) <= 2:
+    is_lightest = observed.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > observed.max()
+    if not is_lightest or len(np.unique(observed)) <= 2:
         return raster
     _LOG.warning("%s: its lightest pixels are nodata: they are taken for roads, too", visible(raster.name))
     return _changed(raster, lambda values, _: (values, None))
@@ -277,20 +277,20 @@ def _of_class(raster: Raster, number: int) -> Raster:
     return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
 
 
-def _without_fill(raster: Raster, seen: AnyArray) -> Raster:
+def _without_fill(raster: Raster, observed: AnyArray) -> Raster:
     """Leave out pixels of a value that lies far from all others, and does not look like roads: nodata by no name.
 
     (n, B) values of a sample were observed.
     """
-    for end in () if len(seen) == 0 else (seen.min(), seen.max()):
-        is_fill = (seen == end).all(axis=1)
-        others = seen[~is_fill].astype(np.float64)
+    for end in () if len(observed) == 0 else (observed.min(), observed.max()):
+        is_fill = (observed == end).all(axis=1)
+        others = observed[~is_fill].astype(np.float64)
         if not is_fill.any() or len(np.unique(others)) < _MANY_VALUES:
             continue
         apart = max(others.min() - float(end), float(end) - others.max())
         if apart > np.ptp(others) and not are_roads((_middle(raster)[0] == end).all(axis=2)):
             _LOG.warning("%s: its value %g, far from all others, is taken for not observed", visible(raster.name), end)
-            return _changed(raster, partial(_known_but, end))
+            return _changed(raster, partial(_all_but, end))
     return raster
 
 
@@ -309,9 +309,9 @@ def _of_colours(raster: Raster) -> Raster:
     return replace(drawn, bands=raster.bands[:1])
 
 
-def _known_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:
-    known = (values != fill).any(axis=2)
-    return values, known if valid is None else known & valid
+def _all_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:
+    not_fill = (values != fill).any(axis=2)
+    return values, not_fill if valid is None else not_fill & valid
 
 
 def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]:
@@ -327,8 +327,8 @@ def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]
         return values, labelled if valid is None else labelled & valid
 
     labelled = _changed(raster, leave_out)
-    seen = sample.seen[sample.seen[:, sample.channel] != unlabelled]
-    return labelled, replace(sample, seen=seen, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
+    rest = sample.observed[sample.observed[:, sample.channel] != unlabelled]
+    return labelled, replace(sample, observed=rest, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
 
 
 def _sample(raster: Raster) -> tuple[AnyArray, AnyArray]:
@@ -403,11 +403,11 @@ def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
     return np.asarray(finite & (np.abs(values) <= limit).all(axis=2), np.bool_)
 
 
-def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
+def _corrected(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
     """Put right what nodata, transparency and inverted masks mix up; refuse a mask that is all road."""
     n_roads = int(np.count_nonzero(roads))
-    n_seen = roads.size if observed is None else int(np.count_nonzero(observed))
-    if n_roads <= 0.5 * n_seen:
+    n_observed = roads.size if observed is None else int(np.count_nonzero(observed))
+    if n_roads <= 0.5 * n_observed:
         return roads, observed
     if n_roads <= _MAX_ROAD_SHARE * roads.size:
         return roads, None  # nodata, or transparent pixels, are the ground between the roads
@@ -444,12 +444,12 @@ def _require_mask(raster: Raster) -> None:
     if max(raster.shape) <= MAX_SIDE and raster.n_unread == 0:
         return
     values, valid = _middle(raster)
-    seen = values[_finite(values, valid)]
+    observed = values[_finite(values, valid)]
     many = f"{raster.name}: has {len(raster.all_bands)} bands; choose the one that holds the roads"
     try:
-        if len(seen):
-            channel = int(np.argmax(seen.std(axis=0)))
-            find_thresholds(Sample(raster.name, seen, channel, lambda: _numbers(values, valid, channel)))
+        if len(observed):
+            channel = int(np.argmax(observed.std(axis=0)))
+            find_thresholds(Sample(raster.name, observed, channel, lambda: _numbers(values, valid, channel)))
     except PhotographError as error:
         if raster.n_unread:
             raise PhotographError(f"{many}, if it is a mask: the first of them look like a photograph") from error

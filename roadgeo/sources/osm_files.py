@@ -137,10 +137,10 @@ def _way_shape(way: Any, factory: Any, census: _Census | None) -> Any:
     except (RuntimeError, osmium.InvalidLocationError):  # fewer than two different nodes, or some without a place
         nodes = list(way.nodes)
     own = [node.location.valid() for node in nodes]
-    found = census.places([node.ref for node in nodes]) if census else np.full((len(nodes), 2), np.nan)
+    points = census.places([node.ref for node in nodes]) if census else np.full((len(nodes), 2), np.nan)
     for k in np.flatnonzero(own):
-        found[k] = nodes[k].location.lon, nodes[k].location.lat
-    return shapely.to_wkb(line_through(found))
+        points[k] = nodes[k].location.lon, nodes[k].location.lat
+    return shapely.to_wkb(line_through(points))
 
 
 @dataclass(frozen=True)
@@ -180,12 +180,12 @@ class _Census:
 
     def places(self, refs: Sequence[int]) -> FloatArray:
         """Return longitudes and latitudes of nodes; (n, 2), NaN where they are not known."""
-        found = np.full((len(refs), 2), np.nan)
+        lonlat = np.full((len(refs), 2), np.nan)
         if len(self.ids):
             at = np.minimum(np.searchsorted(self.ids, refs), len(self.ids) - 1)
-            known = (self.ids[at] == refs) & (np.abs(self.xy[at]) <= (1_800_000_000, 900_000_000)).all(axis=1)
-            found[known] = self.xy[at[known]] / 1e7
-        return found
+            is_stored = (self.ids[at] == refs) & (np.abs(self.xy[at]) <= (1_800_000_000, 900_000_000)).all(axis=1)
+            lonlat[is_stored] = self.xy[at[is_stored]] / 1e7
+        return lonlat
 
 
 def _newest(objects: array[int]) -> tuple[IntArray, set[tuple[int, int]]]:
@@ -207,17 +207,17 @@ def _deleted_ways(path: Path) -> set[int]:
     RoadSourceError
         It is an answer that Overpass did not complete.
     """
-    found, tail = set(), b""
+    ways, tail = set(), b""
     for chunk in read_chunks(path):
         text = tail + chunk
         if b"delete" in text:
             deleted = (_ID.search(tag) for tag in _WAY.findall(text) if _IS_DELETED.search(tag))
-            found |= {int(number[1]) for number in deleted if number}
+            ways |= {int(number[1]) for number in deleted if number}
         if remark := _REMARK.search(text):
             said = remark[1].decode("utf-8", "replace")[:200].strip(" .")
             raise RoadSourceError(f"{path}: {GAVE_UP}: {said}; {ASK_LESS}")
         tail = text[-_MOST_TAG:]
-    return found
+    return ways
 
 
 def _is_pbf(path: Path) -> bool:

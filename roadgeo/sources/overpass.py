@@ -86,7 +86,7 @@ def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tup
     with _asking(options.nominatim_url, options, say, place) as (osmnx, _):
         try:
             with bounded(options.nominatim_url):
-                found = osmnx.geocode_to_gdf(place)
+                areas = osmnx.geocode_to_gdf(place)
         except TypeError as error:
             raise RoadSourceError(
                 f"{place!r} is a point on OpenStreetMap, not an area; name a town or district, "
@@ -96,7 +96,7 @@ def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tup
             if "returned 0 results" not in str(error):
                 raise
             raise RoadSourceError(f"{place!r}: OpenStreetMap knows no such place; check the spelling") from error
-    return found.geometry[0], str(found.display_name[0])
+    return areas.geometry[0], str(areas.display_name[0])
 
 
 def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions, say: Say = say_nothing) -> RoadLines:
@@ -112,7 +112,7 @@ def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions
     kinds = highways(which)
     tags = '["highway"]' if kinds is None else f'["highway"~"^({"|".join(kinds)})$"]'
     tags += '["area"!~"yes"]' + ("" if tunnels else '["tunnel"!~"^(yes|avalanche_protector)$"]')
-    found: dict[tuple[str, str], Any] = {}
+    elements: dict[tuple[str, str], Any] = {}
     stamps: list[str] = []
     with _asking(options.overpass_url, options, say, f"{tags} {area.wkt}") as (osmnx, folder):
         osmnx.settings.cache_only_mode = True
@@ -125,14 +125,14 @@ def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions
         for file in sorted(folder.glob("*.json")):
             with bounded(file):
                 answer = json.loads(file.read_bytes())
-                found |= {(str(item["type"]), str(item["id"])): item for item in answer["elements"]}
+                elements |= {(str(item["type"]), str(item["id"])): item for item in answer["elements"]}
             stamps += re.findall(r"timestamp_osm_base\W+([-\w:]+)", json.dumps(answer.get("osm3s")))
-        if not found:
+        if not elements:
             shutil.rmtree(folder)
-    table = overpass_table(list(found.values()))
-    known = {"server": options.overpass_url, "osm_timestamp": min(stamps, default=None), "date": options.date}
+    table = overpass_table(list(elements.values()))
+    origin = {"server": options.overpass_url, "osm_timestamp": min(stamps, default=None), "date": options.date}
     lines = recognise(table).adapt(table)
-    return replace(lines, meta=lines.meta | {key: value for key, value in known.items() if value})
+    return replace(lines, meta=lines.meta | {key: value for key, value in origin.items() if value})
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> Any:
@@ -169,8 +169,8 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     if not isinstance(polygon, str | os.PathLike):
         return polygon, "the given area"
     path = Path(polygon)
-    found = read_layer(path, None, ())
-    shapes = objects([] if found.shapes is None else found.shapes)
+    layer = read_layer(path, None, ())
+    shapes = objects([] if layer.shapes is None else layer.shapes)
     try:
         parts = simple_areas(shapely.from_wkb(shapes))
     except shapely.errors.ShapelyError as error:
@@ -179,7 +179,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
     if part := what_is_missing(path, len(shapes)):
         _LOG.warning("%s: %s", visible(str(path)), part)
-    crs = crs_name(found.crs)
+    crs = crs_name(layer.crs)
     if crs is None:
         raise RoadSourceError(f"{path}: has no CRS; save the outline with one, for example as GeoJSON")
     return shapely.transform(shapely.union_all(parts), lambda xy: to_lonlat(crs, xy)), path.stem
@@ -213,8 +213,8 @@ def _asking(url: str, options: FetchOptions, say: Say, question: str) -> Iterato
     resolve = socket.getaddrinfo  # osmnx replaces it
     with _folder(f"{url} {options.date} {question}", options.cache) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that a large area takes long: `say` shows that
-        is_known = any(folder.iterdir())
-        if not is_known:
+        was_asked = any(folder.iterdir())
+        if not was_asked:
             say(f"asking {host}")
         settings = {
             "cache_folder": folder,
@@ -223,7 +223,7 @@ def _asking(url: str, options: FetchOptions, say: Say, question: str) -> Iterato
             "http_referer": "roadgeo",
             "http_user_agent": f"roadgeo/{__version__}",
             "nominatim_url": options.nominatim_url,
-            "overpass_rate_limit": is_known or _answers(f"{url}/status"),  # else osmnx would wait a minute
+            "overpass_rate_limit": was_asked or _answers(f"{url}/status"),  # else osmnx would wait a minute
             "overpass_settings": f"[out:json][timeout:{{timeout}}]{_date_setting(options.date)}{{maxsize}}",
             "overpass_url": options.overpass_url,
             "requests_kwargs": {"hooks": {"response": _Watch(host, say)}},

@@ -251,15 +251,15 @@ def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
         if source.crs is None:
             raise CrsError(f"{name}: has no CRS; name it, for example --crs EPSG:26986, crs= in Python")
         return source
-    known, own = name_crs(crs), source.crs
-    if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):
+    named, own = name_crs(crs), source.crs
+    if own is not None and not known_crs(own).equals(known_crs(named), ignore_axis_order=True):
         _LOG.warning(
             "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
             visible(str(name)),
             known_crs(own).name if len(own) > len("EPSG:123456") else own,
             crs,
         )
-    return replace(source, crs=known)
+    return replace(source, crs=named)
 
 
 def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, area: Any = None) -> RoadLines:

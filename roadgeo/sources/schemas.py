@@ -124,7 +124,7 @@ class Schema:
         called = next((columns[name] for name in _NAMES if name in columns), None)
         counts = {"no_roads": int(others.sum()), "broken": _count_broken(shapes)}
         by = " and ".join(name for name, _ in self.kinds)
-        told = {"attribution": self.attribution, "kind_columns": by if self.is_guess else "", **table.meta, **counts}
+        stated = {"attribution": self.attribution, "kind_columns": by if self.is_guess else "", **table.meta, **counts}
         return RoadLines(
             lines,
             crs_name(table.crs),
@@ -132,7 +132,7 @@ class Schema:
             np.full(len(row), "", object) if called is None else _each(called[row], _text),
             np.logical_or.reduce([in_part[place], *tunnels]),
             bool(self.kinds),
-            {"features": len(table.shapes)} | {key: value for key, value in told.items() if value},
+            {"features": len(table.shapes)} | {key: value for key, value in stated.items() if value},
             areas,
         )
 
@@ -140,9 +140,9 @@ class Schema:
         """Return (N,) the kind of each feature, "" where it is not known, and which are no roads."""
         kinds, others = np.full(n, "", object), np.zeros(n, bool)
         for name, words in self.kinds:
-            told = _each(columns.get(name, kinds), partial(_kind_of, words=words))
-            kinds = np.where((kinds == "") | ((kinds == _ROAD) & (told != "")), told, kinds)
-            others |= told == _NONE
+            stated = _each(columns.get(name, kinds), partial(_kind_of, words=words))
+            kinds = np.where((kinds == "") | ((kinds == _ROAD) & (stated != "")), stated, kinds)
+            others |= stated == _NONE
         unknown = kinds == ""
         for name in _OTHER_KEYS:
             others |= unknown & (_each(columns[name], _is_filled).astype(bool) if name in columns else False)
@@ -224,14 +224,14 @@ def _share(values: AnyArray, words: Mapping[str, str]) -> float:
     if not words:
         return 0.0
     sample = _sample(values)
-    known = sum(any(_look_up(word, words) for word in _split(value)) for value in sample)
-    return known / len(sample) if sample else 0.0
+    n_words = sum(any(_look_up(word, words) for word in _split(value)) for value in sample)
+    return n_words / len(sample) if sample else 0.0
 
 
 def _kind_of(value: Any, words: Mapping[str, str]) -> str:
     """Return the `highway` that a value stands for, several with semicolons between them; "" for none."""
-    found = _split(value)
-    kinds = dict.fromkeys(_look_up(word, words) or (word if words is _HIGHWAY else None) for word in found)
+    parts = _split(value)
+    kinds = dict.fromkeys(_look_up(word, words) or (word if words is _HIGHWAY else None) for word in parts)
     roads = [kind for kind in kinds if kind not in (None, _NONE)]
     return ";".join(map(str, roads)) or (_NONE if _NONE in kinds else "")
 
@@ -280,9 +280,9 @@ def _tag(values: AnyArray, key: str) -> AnyArray:
 def _rules(value: Any) -> list[tuple[Any, list[str]]]:
     """Return Overture's flags of a segment: each with the part that it holds for, two shares of its length, or None."""
     rules, lists = _json(value), list | tuple | np.ndarray
-    known = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
+    mappings = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
     return [
-        (rule.get("between"), [*map(str, flags)]) for rule in known if isinstance(flags := rule.get("values"), lists)
+        (rule.get("between"), [*map(str, flags)]) for rule in mappings if isinstance(flags := rule.get("values"), lists)
     ]
 
 
@@ -315,9 +315,9 @@ def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, Boo
 
 def _text(value: Any) -> str:
     """Return the name of a street, "" for none; of Overture's names the primary one."""
-    told = _json(value)
-    told = told.get("primary") if isinstance(told, dict) else value
-    return ";".join(map(str, told)) if isinstance(told, list | tuple) else str(told) if _is_filled(told) else ""
+    parsed = _json(value)
+    parsed = parsed.get("primary") if isinstance(parsed, dict) else value
+    return ";".join(map(str, parsed)) if isinstance(parsed, list | tuple) else str(parsed) if _is_filled(parsed) else ""
 
 
 def _json(value: Any) -> Any:

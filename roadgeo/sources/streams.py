@@ -60,19 +60,19 @@ def list_sources(path: Path) -> list[Path]:
 
 
 def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
-    found = [file for file in files if file.name.lower().endswith(QUERY_ENDINGS)]
-    others = [file for file in files if file not in found and not file.name.startswith(".")]
+    candidates = [file for file in files if file.name.lower().endswith(QUERY_ENDINGS)]
+    others = [file for file in files if file not in candidates and not file.name.startswith(".")]
     unread = Counter("folder" if file.is_dir() else file.suffix.lower() or "without a suffix" for file in others)
     listed = ", ".join(f"{n} {suffix}" for suffix, n in sorted(unread.items()) if not _BESIDE.fullmatch(suffix))
     if listed:
         _LOG.warning("%s: passed over: %s: not read from a folder", visible(str(folder)), visible(listed))
-    if not found:
+    if not candidates:
         raise RoadSourceError(f"{folder}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
-    if len(found) == 1:
-        return found
+    if len(candidates) == 1:
+        return candidates
     why: dict[Path, str] = {}
     tells: dict[Path, bool] = {}
-    for file in found:
+    for file in candidates:
         if _is_own(file):
             why[file] = "a result or a reference of roadgeo"
             continue
@@ -91,9 +91,9 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
         _LOG.warning(
             "%s: passed over: %s; to take it all the same give it by its name", visible(str(file)), visible(reason)
         )
-    kept = [file for file in found if file not in why]
+    kept = [file for file in candidates if file not in why]
     if not kept:
-        raise RoadSourceError(f"{folder}: none of its {len(found)} files holds roads; name the file that does")
+        raise RoadSourceError(f"{folder}: none of its {len(candidates)} files holds roads; name the file that does")
     return kept
 
 

@@ -45,14 +45,14 @@ def name_crs(crs: Any) -> str:
     text = f"{str(crs)[:60]!r}"
     expected = "expected for example EPSG:3857, 3857, a name such as 'WGS 84 / UTM zone 29N', or WKT"
     try:
-        known = known_crs(crs)
+        resolved = known_crs(crs)
     except CRSError as error:
         raise NoCrsError(f"{text} is no CRS that PROJ knows; {expected}") from error
-    known = known.to_2d() if len(known.axis_info) == 3 else known
-    if not (known.is_geographic or known.is_projected):
-        raise NoCrsError(f"{text} is no CRS of a map, but a {known.type_name}; {expected}")
-    code = known.to_epsg(min_confidence=100)
-    return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
+    resolved = resolved.to_2d() if len(resolved.axis_info) == 3 else resolved
+    if not (resolved.is_geographic or resolved.is_projected):
+        raise NoCrsError(f"{text} is no CRS of a map, but a {resolved.type_name}; {expected}")
+    code = resolved.to_epsg(min_confidence=100)
+    return f"EPSG:{code}" if code else resolved.to_wkt("WKT2_2019")
 
 
 def crs_name(crs: Any) -> str | None:

@@ -230,8 +230,8 @@ def _of_python() -> set[str]:
     """Return the folders of the interpreter and of packages: not the current one, where anything may lie."""
     here = Path(__file__).resolve().parents[1]
     folders = {sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values(), str(here)}
-    found = {os.path.realpath(path) for path in (*folders, *filter(None, sys.path))}
-    return found - {os.path.realpath(Path.cwd())}
+    paths = {os.path.realpath(path) for path in (*folders, *filter(None, sys.path))}
+    return paths - {os.path.realpath(Path.cwd())}
 
 
 def _of_libraries() -> list[str]:

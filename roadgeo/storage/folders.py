@@ -69,10 +69,10 @@ def is_private(folder: Path) -> bool:
     if not hasattr(os, "getuid"):  # Windows: the folders of a user are their own
         return folder.is_dir()
     try:
-        found, around = folder.lstat(), folder.parent.stat()
+        status, around = folder.lstat(), folder.parent.stat()
     except OSError:
         return False
-    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    mine = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
     safe = around.st_uid in (0, os.getuid())
     return mine and safe and (not around.st_mode & 0o002 or bool(around.st_mode & stat.S_ISVTX))
 

@@ -178,15 +178,15 @@ def read_layer(path: str | os.PathLike[str], name: str) -> tuple[list[FloatArray
         columns = database.execute("SELECT name, pk FROM pragma_table_info(?)", (name,)).fetchall()
         key = next((column for column, primary in columns if primary), "rowid")
         rows = database.execute(f"SELECT * FROM {_quoted(name)} ORDER BY {_quoted(key)}").fetchall()
-        found = database.execute(
+        geometry_column = database.execute(
             "SELECT column_name FROM gpkg_geometry_columns WHERE table_name = ?", (name,)
         ).fetchall()
     table = {column: [row[i] for row in rows] for i, (column, _) in enumerate(columns)}
-    if not found:
+    if not geometry_column:
         return [], table
-    if found[0][0] not in table:
+    if geometry_column[0][0] not in table:
         raise IndexFormatError(f"{path}: layer '{name}' lacks its column of geometries; make the file again")
-    return [_decode(blob, path, name) for blob in table.pop(found[0][0])], table
+    return [_decode(blob, path, name) for blob in table.pop(geometry_column[0][0])], table
 
 
 def require_tables(database: sqlite3.Connection, path: str | os.PathLike[str], *names: str) -> None:

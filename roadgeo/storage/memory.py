@@ -92,8 +92,8 @@ def _held_bytes() -> int | None:
 
 def _available_bytes() -> int:
     """Return the memory that is free, or can be made so."""
-    found = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text("ascii"))
-    return int(found[1]) << 10 if found else _FREE
+    match = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text("ascii"))
+    return int(match[1]) << 10 if match else _FREE
 
 
 def give_back_memory() -> None:

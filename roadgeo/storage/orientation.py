@@ -46,8 +46,8 @@ _STEPS = {
 
 def read_orientation(path: str | os.PathLike[str]) -> int:
     """Return the orientation of a JPEG, TIFF, PNG or WebP, 1 to 8; 1, upright, without the tag."""
-    found = read_tag(path, _TAG)
-    return found[0] if isinstance(found, tuple) and found[0] in _STEPS else UPRIGHT
+    tag = read_tag(path, _TAG)
+    return tag[0] if isinstance(tag, tuple) and tag[0] in _STEPS else UPRIGHT
 
 
 def read_tag(path: str | os.PathLike[str], tag: int, *within: int) -> tuple[Any, ...] | str | None:
@@ -80,13 +80,13 @@ def read_tag(path: str | os.PathLike[str], tag: int, *within: int) -> tuple[Any,
 def read_resolution(path: str | os.PathLike[str]) -> tuple[float, float]:
     """Return the pixels in a unit of length along rows and along columns, where such a file gives it; else (0, 0)."""
     across, down = (next(iter(read_tag(path, tag) or ()), 0.0) for tag in _RESOLUTION)
-    found = float(across), float(down)
+    per_metre = float(across), float(down)
     try:
         with open(path, "rb") as file:  # noqa: PTH123
             stated = (_density(*part) for part in _parts(file))
-            return next((density for density in stated if density), found)
+            return next((density for density in stated if density), per_metre)
     except (OSError, ValueError, struct.error):
-        return found
+        return per_metre
 
 
 def turn_upright(array: AnyArray, orientation: int) -> AnyArray:
@@ -174,9 +174,9 @@ def tiff_values(file: BinaryIO, start: int, wanted: int, *within: int) -> Iterat
 def tiff_pages(file: BinaryIO, wanted: int) -> Iterator[int]:
     """Yield the number in a tag of each directory of a TIFF, 0 where it has none; errors as of `tiff_values`."""
     layout = _Layout.of(file, 0)
-    at, known = layout.first, set[int]()
-    while at and at not in known and len(known) < _MAX_PARTS:
-        known.add(at)
+    at, visited = layout.first, set[int]()
+    while at and at not in visited and len(visited) < _MAX_PARTS:
+        visited.add(at)
         value = next(layout.values(file, at, wanted), (0, b"", ""))[1]
         yield int.from_bytes(value[:4], "little" if layout.order == "<" else "big")
         at = layout.next(file, at)

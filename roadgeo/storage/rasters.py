@@ -250,9 +250,9 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
     beside = Path(os.fspath(path) + ".aux.xml")
     if not beside.is_file() or beside.stat().st_size > _MAX_SIDECAR:
         return None
-    found = re.search(rb"<NoDataValue[^<>]*+>\s*+([-+.0-9eEnaif]{1,32})\s*+</", beside.read_bytes())
+    match = re.search(rb"<NoDataValue[^<>]*+>\s*+([-+.0-9eEnaif]{1,32})\s*+</", beside.read_bytes())
     try:
-        return float(found[1]) if found else None
+        return float(match[1]) if match else None
     except ValueError:
         return None
 

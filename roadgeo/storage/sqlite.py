@@ -51,12 +51,12 @@ def _guard(database: sqlite3.Connection, path: Path) -> None:
 
 def table_problem(database: sqlite3.Connection, name: str) -> str:
     """Return why a name is no plain table with stored columns; "" where it is one."""
-    found = database.execute(
+    row = database.execute(
         "SELECT type, sql FROM sqlite_master WHERE lower(name) = lower(?) AND type IN ('table', 'view')", (name,)
     ).fetchone()
-    if found is None:
+    if row is None:
         return f"has no layer '{name}'"
-    kind, sql = found
+    kind, sql = row
     if kind != "table" or str(sql).split()[:2][-1].upper() == "VIRTUAL":
         return f"'{name}' is a {'view' if kind == 'view' else 'virtual table'}, expected a table"
     columns = database.execute("SELECT name, dflt_value, hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()

@@ -98,8 +98,8 @@ def read_layer(
         _require_stored(path, layer)
         part = {"skip_features": skip, "max_features": most, "columns": list(columns), "force_2d": True}
         info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, **more))
-        found, notes = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
-    meta, _, shapes, values = found
+        decoded, notes = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
+    meta, _, shapes, values = decoded
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
     return VectorLayer(shapes, named, meta["crs"], info["driver"], notes)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadgeo.geometry.pinhole import make_view
-from roadgeo.geometry.pose import Pose, SeenCorners, find_pose, fit_pinhole, pinhole_residuals, turned
+from roadgeo.geometry.pose import CornerTargets, Pose, find_pose, fit_pinhole, pinhole_residuals, turned
 
 SIZE = (1200, 900)
 FOCAL = 1000.0
@@ -113,7 +113,7 @@ def test_no_camera_sees_a_mirrored_or_broken_frame() -> None:
 
 def test_a_pinhole_that_sees_the_sky_is_no_start() -> None:
     corners = np.array([[-600.0, 450.0], [600.0, 450.0], [600.0, -450.0], [-600.0, -450.0]])
-    seen = SeenCorners(corners, np.zeros((4, 2)), np.eye(8), np.log(FOCAL), 0.45)
+    seen = CornerTargets(corners, np.zeros((4, 2)), np.eye(8), np.log(FOCAL), 0.45)
     sky, ground = ([0.0, 0.0, 0.0, 0.0, tilt, 0.0, np.log(FOCAL)] for tilt in (1.5, 0.3))
     assert np.isinf(pinhole_residuals(np.array(sky), seen)).all()
     assert fit_pinhole(np.array([sky]), seen) is None

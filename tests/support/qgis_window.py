@@ -300,7 +300,7 @@ def mend(dock):
     dock.draw()
     answer["drawn"] = fill_and_run(dock.drawing, "place")["results"]
     answer["layer"] = any(one.name() == "drone by points" for one in PROJECT.mapLayers().values())
-    answer["matrix"] = dock.found.matrix.tolist()
+    answer["matrix"] = dock.fitted.matrix.tolist()
     # A picture without points: four are clicked, on the picture and on the map in turn.
     answer["refused"] = dock.open(TASK["picture"], TASK["picture"])
     answer["refused_said"] = dock.status.text()

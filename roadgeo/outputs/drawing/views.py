@@ -165,10 +165,10 @@ def _picture_layer(subject: Subject, image: AnyArray, box: Box) -> Layer:
 
 def probability_layer(subject: Subject) -> list[Layer]:
     """Return a segmenter's probability, lighter where higher; nothing without one."""
-    seen, views = subject.mask.probability, subject.views
-    if seen is None:
+    values, views = subject.mask.probability, subject.views
+    if values is None:
         return []
-    image = _tinted(np.where(seen == _UNKNOWN, 0, seen).astype(np.uint8), _PROBABLE, views.picture_px)
+    image = _tinted(np.where(values == _UNKNOWN, 0, values).astype(np.uint8), _PROBABLE, views.picture_px)
     picture = Picture(image, subject.box, views.picture_bytes, lossless=True)
     return [Layer("probability", "probability of road", [picture], shown=False)]
 
@@ -194,8 +194,8 @@ def place_layers(subject: Subject, window: Window) -> list[Layer]:
     ]
     matches = subject.largest_residuals()
     if matches is not None:
-        at, found = window.place(matches.reference_xy), window.place(place.to_crs(plane_to_pixel(matches.query_xy)))
-        layers.append(Layer("residuals", "residuals", [Arrows(at, found - at)]))
+        at, placed = window.place(matches.reference_xy), window.place(place.to_crs(plane_to_pixel(matches.query_xy)))
+        layers.append(Layer("residuals", "residuals", [Arrows(at, placed - at)]))
         layers.append(Layer("matches", "matched intersections", [Dots(at)]))
     sigma = subject.location.corner_sigma_m
     if sigma is not None:

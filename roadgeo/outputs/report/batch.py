@@ -86,8 +86,8 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     shown = entries[:_MAX_LISTED]
     left_out = len(entries) - len(shown)
     maps = [(index, [entry for entry in shown if entry.document.get("reference") == index.name]) for index in indexes]
-    maps = [(index, found) for i, (index, found) in enumerate(maps) if i == 0 or any(map(_has_place, found))]
-    views = [_draw_map(index, found) for index, found in maps]
+    maps = [(index, placed) for i, (index, placed) in enumerate(maps) if i == 0 or any(map(_has_place, placed))]
+    views = [_draw_map(index, placed) for index, placed in maps]
     others = [section(f"On {index.name}", view) for (index, _), view in zip(maps[1:], views[1:], strict=True)]
     note = f'<p class="faint">{left_out} more are not listed; all are in the tables beside this page.</p>'
     shared = Counter(entry.path.name for entry in shown)

@@ -104,16 +104,16 @@ def _roads_in(place: Georeference, index: ReferenceIndex) -> list[Lines]:
 
 def _numbers(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Label and value of all that is known."""
-    found, center = document.get("displacement"), document.get("center")
+    offset, center = document.get("displacement"), document.get("center")
     rows = []
-    if found is not None:
+    if offset is not None:
         rows += [
-            ("Move it", f"{found['east_m']:+.2f} m east, {found['north_m']:+.2f} m north"),
-            ("Turn it", f"{found['turn_deg']:+.3f}° clockwise"),
-            ("Scale it by", f"{found['scale']:.5f}"),
+            ("Move it", f"{offset['east_m']:+.2f} m east, {offset['north_m']:+.2f} m north"),
+            ("Turn it", f"{offset['turn_deg']:+.3f}° clockwise"),
+            ("Scale it by", f"{offset['scale']:.5f}"),
         ]
-        if "off_m" in found:
-            rows.append(("Off, mean of the frame", f"{found['off_m']:.2f} ± {found['sigma_m']:.2f} m"))
+        if "off_m" in offset:
+            rows.append(("Off, mean of the frame", f"{offset['off_m']:.2f} ± {offset['sigma_m']:.2f} m"))
     if document.get("agreeing") is not None:
         rows.append(("Roads that agree", f"{document['agreeing']:.0%}, as it is {document['agreeing_as_given']:.0%}"))
     if document.get("log10_lead") is not None:

@@ -98,8 +98,8 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def canExecute(self) -> tuple[bool, str]:
         """Whether roadgeo is there; if not, the remedy."""
-        found = locate_executable() is not None
-        return found, "" if found else NOT_FOUND
+        is_installed = locate_executable() is not None
+        return is_installed, "" if is_installed else NOT_FOUND
 
     def initAlgorithm(self, configuration: Any = None) -> None:  # noqa: ARG002 (QGIS's signature)
         """Declare parameters and outputs."""
@@ -149,7 +149,7 @@ class BuildReference(RoadgeoAlgorithm):
         if path:
             remember_reference(path)
         else:
-            path = max((known.file for known in list_references(fresh=True) if known.file), key=os.path.getmtime)
+            path = max((one.file for one in list_references(fresh=True) if one.file), key=os.path.getmtime)
         for layer in ("coverage", "roads", "intersections"):
             session.show(Path(path), f"{Path(path).stem} {layer}", layer)
         return {"OUTPUT": path}
@@ -159,8 +159,8 @@ def _references(values: Values) -> list[str]:
     """Name the reference that was chosen; where none was, all that QGIS knows of."""
     if values.given("REFERENCE"):
         return [f"--reference={values.reference()}"]
-    known = list_references() if remembered_references() else []  # by itself the program searches its whole library
-    return [f"--reference={reference.value}" for reference in known]
+    shelved = list_references() if remembered_references() else []  # by itself the program searches its whole library
+    return [f"--reference={reference.value}" for reference in shelved]
 
 
 _LOCATION_OUTPUTS = {
@@ -224,8 +224,8 @@ class LocateMasks(RoadgeoAlgorithm):
         """Locate them; load the footprints."""
         masks, folder = values.path("String", "MASKS"), values.path("String", "OUTPUT_FOLDER")
         to = ["--json", f"--out-dir={folder}", *_references(values)]
-        found = session.call("locate", masks, *to, *self.arguments(values), some_may_fail=True)
-        statuses = [location["status"] for location in found]
+        result = session.call("locate", masks, *to, *self.arguments(values), some_may_fail=True)
+        statuses = [location["status"] for location in result]
         located, failed = statuses.count("located"), statuses.count("error")
         results = {"OUTPUT_FOLDER": folder, "LOCATED": located, "FAILED": failed}
         results["NOT_LOCATED"] = len(statuses) - located - failed
@@ -275,10 +275,10 @@ def _locate(mask: str, picture: str, options: list[str], values: Values, session
     folder = Path(values.path("String", "OUTPUT_FOLDER"))
     to = ["--json", f"--out-dir={folder}", "--also=match-points", *_references(values)]
     results: dict[str, Any] = {"OUTPUT_FOLDER": str(folder)}
-    found = session.call("locate", mask, *to, *options)
-    if not found:
+    locations = session.call("locate", mask, *to, *options)
+    if not locations:
         return results
-    location, name = found[0], Path(mask).stem
+    location, name = locations[0], Path(mask).stem
     results |= {"STATUS": location["status"], "REASON": location["reason"]}
     page, points = folder / f"{name}_report.html", folder / f"{Path(picture).name}_matches.points"
     if values.get("Boolean", "REPORT") and page.exists():
@@ -362,22 +362,22 @@ class SetUp(RoadgeoAlgorithm):
             raise QgsProcessingException(f"{named} is not a program of this computer: give its full path")
         if values.get("Boolean", "INSTALL"):
             source, folder = values.get("String", "SOURCE"), values.path("File", "FOLDER")
-            found = install(program, source, Path(folder), session)
+            result = install(program, source, Path(folder), session)
         else:
-            found = program or locate_executable() or ""
-        if not found:
+            result = program or locate_executable() or ""
+        if not result:
             advice = f"To install it, tick “{given.SETUP[1].label}”, or name it above."
             raise QgsProcessingException(f"The program roadgeo was not found on this computer. {advice}")
-        self.found = {"FOUND": found, "VERSION": ask_version(found, session)}
-        return self.found
+        self.program = {"FOUND": result, "VERSION": ask_version(result, session)}
+        return self.program
 
     def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:
         """Remember it, where QGIS keeps its settings."""
-        configure(self.found["FOUND"])
+        configure(self.program["FOUND"])
         if iface is not None:
             from .messages import announce_ready
 
-            announce_ready(self.found["VERSION"])
+            announce_ready(self.program["VERSION"])
         return super().postProcessAlgorithm(context, feedback)
 
 

@@ -82,7 +82,7 @@ class MatchDock(QDockWidget):
         super().__init__("roadgeo: mend a place by hand", parent)
         self.setObjectName("RoadgeoMatches")
         self.matches: list[Match] = []
-        self.found = Fit(None)
+        self.fitted = Fit(None)
         self.apart: list[float] = []
         self.rows: list[_Row] = []
         self.crs, self.picture, self.size = "", "", (0, 0)
@@ -155,12 +155,12 @@ class MatchDock(QDockWidget):
 
     def _located(self) -> list[tuple[str, str, str]]:
         """List name, picture and points of the pictures located in this project, the current layer first."""
-        found = {}
+        names = {}
         for layer in [iface.activeLayer(), *QgsProject.instance().layerTreeRoot().layerOrder()]:
             picture, points = (layer.customProperty(key) if layer else "" for key in (PICTURE_KEPT, POINTS_KEPT))
             if picture and Path(picture).is_file():
-                found[picture, points] = layer.name()
-        return [(name, picture, points if Path(points).is_file() else "") for (picture, points), name in found.items()]
+                names[picture, points] = layer.name()
+        return [(name, picture, points if Path(points).is_file() else "") for (picture, points), name in names.items()]
 
     def open_first(self) -> None:
         """Open what was located last, or the picture of the current layer; without either, offer a choice."""
@@ -254,8 +254,8 @@ class MatchDock(QDockWidget):
         """
         self._clicked[side] = (u, v)
         other = "map" if side == "picture" else "picture"
-        if self.found.matrix is not None and len(self._clicked) == 1:
-            matrix = self.found.matrix if side == "picture" else np.linalg.inv(self.found.matrix)
+        if self.fitted.matrix is not None and len(self._clicked) == 1:
+            matrix = self.fitted.matrix if side == "picture" else np.linalg.inv(self.fitted.matrix)
             self._clicked[other] = tuple(place(matrix, np.array([[u, v]]))[0].tolist())
         if len(self._clicked) == 2:
             self.remember()
@@ -293,7 +293,7 @@ class MatchDock(QDockWidget):
 
     def refit(self) -> None:
         """Fit anew, and show it."""
-        self.found = fit(self.matches)
+        self.fitted = fit(self.matches)
         self.apart = self._residuals()
         unit = "m" if self._measure() is not None else "map units"
         self.list.setHeaderLabels(["Point", f"Residual ({unit})", "Pixel"])
@@ -321,9 +321,9 @@ class MatchDock(QDockWidget):
     def _residuals(self) -> list[float]:
         """Return the distance of each point from where the fit puts it, in metres where they can be measured."""
         measure = self._measure()
-        if measure is None or self.found.matrix is None:
-            return self.found.residuals
-        fitted = place(self.found.matrix, np.array([(match.column, match.row) for match in self.matches]))
+        if measure is None or self.fitted.matrix is None:
+            return self.fitted.residuals
+        fitted = place(self.fitted.matrix, np.array([(match.column, match.row) for match in self.matches]))
         pairs = zip(fitted.tolist(), self.matches)  # noqa: B905 (as long as each other)
         return [measure.measureLine(QgsPointXY(*there), QgsPointXY(match.x, match.y)) for there, match in pairs]
 
@@ -332,7 +332,7 @@ class MatchDock(QDockWidget):
         text = f"{len(used)} of {len(self.matches)} points"
         if self.adding:
             text = "Click a spot on the picture or on the map; then drag the point to where it belongs."
-        elif self.found.matrix is None:
+        elif self.fitted.matrix is None:
             text += f" are on: a fit needs {FEWEST}, not on one line." if self.picture else ""
         else:
             text += f", {rms(used):.2f} {'m' if self._measure() is not None else 'map units'} root mean square"
@@ -348,15 +348,15 @@ class MatchDock(QDockWidget):
             self.canvas.put(number, match.x, match.y, color, number in chosen)
         points = [QgsPointXY(*corner) for corner in self.footprint()]
         self.band.setToGeometry(QgsGeometry.fromPolygonXY([points] if points else []), None)
-        self.buttons["Put on the map..."].setEnabled(self.found.matrix is not None)
+        self.buttons["Put on the map..."].setEnabled(self.fitted.matrix is not None)
         self.buttons["Delete"].setEnabled(bool(chosen))
         self.buttons["Undo"].setEnabled(bool(self._past))
 
     def footprint(self) -> list[tuple[float, float]]:
         """Return the picture's corners on the map; none without a fit."""
-        if self.found.matrix is None:
+        if self.fitted.matrix is None:
             return []
-        return [(float(x), float(y)) for x, y in place(self.found.matrix, corners(*self.size))]
+        return [(float(x), float(y)) for x, y in place(self.fitted.matrix, corners(*self.size))]
 
     # --- exporting ----------------------------------------------------------------------------------------------------
 
@@ -377,7 +377,7 @@ class MatchDock(QDockWidget):
                 path, self.picture, GCPs=points, outputSRS=self.crs or None, creationOptions=["COMPRESS=DEFLATE"]
             )
         else:
-            Path(path).write_text(format_points(self.crs, self.matches, self.found), "utf-8")
+            Path(path).write_text(format_points(self.crs, self.matches, self.fitted), "utf-8")
         self.status.setText(f"Wrote {path}")
 
     def draw(self) -> None:

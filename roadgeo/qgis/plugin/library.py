@@ -72,8 +72,8 @@ def list_references(fresh: bool = False) -> list[Reference]:
     if command is not None and (fresh or time.monotonic() - _ASKED[0] > _FRESH_S):
         lines: list[str] = []
         run([*command, "reference", "list", "--json"], lambda _, line: lines.append(line), lambda: False)
-        found = [list(document["files"]) for document in map(parse, lines) if document and document.get("files")]
-        _SHELVED[:] = [Reference(Path(files[0]).stem, Path(files[0]).stem, _geopackage(files)) for files in found]
+        files_of = [list(document["files"]) for document in map(parse, lines) if document and document.get("files")]
+        _SHELVED[:] = [Reference(Path(files[0]).stem, Path(files[0]).stem, _geopackage(files)) for files in files_of]
         _ASKED[0] = time.monotonic()
     return [*_SHELVED, *(Reference(Path(file).stem, file, _geopackage([file])) for file in remembered_references())]
 
@@ -84,23 +84,23 @@ def _geopackage(files: list[str]) -> str:
 
 def find_reference(value: str) -> Reference:
     """Return the reference that a name or a file stands for."""
-    known = (reference for reference in list_references() if value in (reference.name, reference.value))
-    return next(known, Reference(Path(value).stem, value, _geopackage([value])))
+    named = (reference for reference in list_references() if value in (reference.name, reference.value))
+    return next(named, Reference(Path(value).stem, value, _geopackage([value])))
 
 
 def list_places(location: dict[str, Any]) -> list[Place]:
     """List the places at which a picture may lie, the best first, with the maps that hold them."""
     lead = location["log10_odds"] or 0.0
     best = [{**location, "log10_odds": 0.0}] if location["center"] else []
-    maps = sorted(list_references(), key=lambda known: known.name != location["reference"])
-    boxes = [(known.name, _box(known.file)) for known in maps if known.file]
+    maps = sorted(list_references(), key=lambda reference: reference.name != location["reference"])
+    boxes = [(reference.name, _box(reference.file)) for reference in maps if reference.file]
     places: list[Place] = []
-    for found in [*best, *location["alternatives"]]:
-        lon, lat, odds = found["center"]["lon"], found["center"]["lat"], found["log10_odds"] or 0.0
+    for listed in [*best, *location["alternatives"]]:
+        lon, lat, odds = listed["center"]["lon"], listed["center"]["lat"], listed["log10_odds"] or 0.0
         on = (name for name, box in boxes if box.contains(QgsPointXY(lon, lat)))
         # On its own map a place has odds against the best; where it is itself the best there, the lead is the least.
         less = -odds if odds < 0.0 else max(lead, 0.0)
-        footprint = found.get("footprint_lonlat") or []
+        footprint = listed.get("footprint_lonlat") or []
         places.append(Place(lon, lat, less if places else 0.0, next(on, ""), footprint))
     return places
 

@@ -96,8 +96,8 @@ class Values:
 
 def name_crs(crs: Any) -> str:
     """Name a CRS so that others know it: those that users define are known to QGIS only."""
-    known = crs.authid() and not crs.authid().startswith("USER:")
-    return str(crs.authid() if known else crs.toWkt())
+    has_name = crs.authid() and not crs.authid().startswith("USER:")
+    return str(crs.authid() if has_name else crs.toWkt())
 
 
 @dataclass(frozen=True)

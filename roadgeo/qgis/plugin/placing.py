@@ -33,18 +33,18 @@ def make_location(picture: str, points: str) -> tuple[dict[str, Any], float]:
         wkt, matches = read_points(points)
     except ValueError as error:
         raise QgsProcessingException(str(error)) from error
-    crs, found, layer = QgsCoordinateReferenceSystem.fromWkt(wkt), fit(matches), QgsRasterLayer(picture, "picture")
-    if found.matrix is None:
+    crs, fitted, layer = QgsCoordinateReferenceSystem.fromWkt(wkt), fit(matches), QgsRasterLayer(picture, "picture")
+    if fitted.matrix is None:
         raise QgsProcessingException(f"{points}: needs {FEWEST} points that are on, not on one line")
     if not crs.isValid():
         raise QgsProcessingException(f"{points}: does not say in which CRS its points are")
     width, height = layer.width(), layer.height()
     frame = np.array([*corners(width, height), (width / 2, height / 2), (width / 2, 0.0)])
-    there = place(found.matrix, frame).tolist()
+    there = place(fitted.matrix, frame).tolist()
     spots = [QgsPointXY(*spot) for spot in there]
     transform = QgsCoordinateTransform(crs, QgsCoordinateReferenceSystem("EPSG:4326"), QgsProject.instance())
     lonlat = [[spot.x(), spot.y()] for spot in map(transform.transform, spots)]
-    used = [apart for match, apart in zip(matches, found.residuals) if match.on]  # noqa: B905 (as long as each other)
+    used = [apart for match, apart in zip(matches, fitted.residuals) if match.on]  # noqa: B905 (as long as each other)
     location = {
         "schema": "roadgeo.location/1",
         "query": picture,
@@ -52,7 +52,7 @@ def make_location(picture: str, points: str) -> tuple[dict[str, Any], float]:
         "reason": f"placed by {len(used)} control points",
         "crs": wkt,
         "size": [width, height],
-        "homography": found.matrix.tolist(),
+        "homography": fitted.matrix.tolist(),
         "footprint": there[:4],
         "footprint_lonlat": lonlat[:4],
         "center": dict(zip(("x", "y", "lon", "lat"), (*there[4], *lonlat[4]))),  # noqa: B905

@@ -35,9 +35,10 @@ class _Wrapper(WidgetWrapper):
         self.combo.setEditable(True)
         if self.parameterDefinition().flags() & QgsProcessingParameterDefinition.Flag.FlagOptional:
             self.combo.addItem("All that there are", "")
-        for known in list_references():
+        for one in list_references():
             self.combo.addItem(
-                known.name if known.value == known.name else f"{known.name} ({known.value})", known.value
+                one.name if one.value == one.name else f"{one.name} ({one.value})",
+                one.value,
             )
         self.combo.currentIndexChanged.connect(lambda: self.widgetValueHasChanged.emit(self))
         button, whole, row = QToolButton(), QWidget(), QHBoxLayout()
@@ -56,13 +57,13 @@ class _Wrapper(WidgetWrapper):
             self.setValue(path)
 
     def setValue(self, value: Any) -> None:
-        known = self.combo.findData(value or "")
-        if known >= 0:
-            self.combo.setCurrentIndex(known)
+        index = self.combo.findData(value or "")
+        if index >= 0:
+            self.combo.setCurrentIndex(index)
         elif value:
             self.combo.setEditText(str(value))
 
     def value(self) -> str:
         text = str(self.combo.currentText()).strip()
-        known = self.combo.findText(text)
-        return str(self.combo.itemData(known)) if known >= 0 else text
+        index = self.combo.findText(text)
+        return str(self.combo.itemData(index)) if index >= 0 else text

@@ -79,10 +79,10 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
     return crs, matches
 
 
-def format_points(crs: str, matches: Sequence[Match], found: Fit) -> str:
+def format_points(crs: str, matches: Sequence[Match], fitted: Fit) -> str:
     """Return the text that `read_points` and the Georeferencer read."""
     lines = [*([f"#CRS: {crs}"] if crs else []), _COLUMNS]
-    for match, apart in zip(matches, np.nan_to_num(found.residuals).tolist()):  # noqa: B905 (as long as each other)
+    for match, apart in zip(matches, np.nan_to_num(fitted.residuals).tolist()):  # noqa: B905 (as long as each other)
         lines.append(f"{match.x!r},{match.y!r},{match.column!r},{-match.row!r},{int(match.on)},0,0,{apart!r}")
     return "\n".join(lines) + "\n"
 

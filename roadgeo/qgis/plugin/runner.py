@@ -80,8 +80,8 @@ def find_executable(configured: str, environ: Mapping[str, str], home: Path, bes
     remembered = beside / REMEMBERED
     names = [environ.get("ROADGEO_EXECUTABLE", ""), remembered.read_text("utf-8") if remembered.is_file() else ""]
     names += [_NAME, *(str(place / _NAME) for pattern in _PLACES for place in sorted(home.glob(pattern)))]
-    found = (find_program(name.strip(), environ) for name in names if name.strip())
-    return next(filter(None, found), None)
+    programs = (find_program(name.strip(), environ) for name in names if name.strip())
+    return next(filter(None, programs), None)
 
 
 def find_pythons(environ: Mapping[str, str], home: Path) -> list[str]:
@@ -131,11 +131,11 @@ def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
         Labels of the options of the algorithm that runs, by their names on the command line.
     """
     text = re.sub(
-        r"`roadgeo (\w+)[^`]*`", lambda found: f"“{_COMMANDS[found[1]]}”" if found[1] in _COMMANDS else found[0], text
+        r"`roadgeo (\w+)[^`]*`", lambda match: f"“{_COMMANDS[match[1]]}”" if match[1] in _COMMANDS else match[0], text
     )
     text = re.sub(r" ?Try 'roadgeo [^']*'\.?", "", text)
     text = re.sub(r"pip install '(roadgeo\[\w+\])'", r"“Set up roadgeo” installs \1", text)
-    return re.sub(r"--[a-z][a-z-]*", lambda found: f"“{labels[found[0]]}”" if found[0] in labels else found[0], text)
+    return re.sub(r"--[a-z][a-z-]*", lambda match: f"“{labels[match[0]]}”" if match[0] in labels else match[0], text)
 
 
 def child_environment(environ: Mapping[str, str]) -> dict[str, str]:

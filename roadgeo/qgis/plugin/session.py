@@ -182,7 +182,7 @@ class Session:
             details = QgsProcessingContext.LayerDetails(title, project, title, hint)
             details.forceName = True
             styler = _Styler(group, kept or {})
-            _STYLERS[:] = [*(known for known in _STYLERS if not sip.isdeleted(known)), styler]
+            _STYLERS[:] = [*(one for one in _STYLERS if not sip.isdeleted(one)), styler]
             details.setPostProcessor(styler)
             self.context.addLayerToLoadOnCompletion(source, details)
         return source

@@ -66,7 +66,7 @@ def locate_command() -> list[str] | None:
 def remember_reference(path: str) -> None:
     """Remember a reference that lies outside roadgeo's library."""
     path = str(Path(path).absolute())
-    kept = [known for known in remembered_references() if known != path]
+    kept = [one for one in remembered_references() if one != path]
     QgsSettings().setValue(_REFERENCES, "\n".join([path, *kept][:_MOST]))
 
 

@@ -29,7 +29,7 @@ def open_dialog(algorithm: str, parameters: dict[str, Any]) -> Any:
 def keep(dialog: Any) -> None:
     """Show a dialog, and keep it for as long as it is open."""
     dialog.show()
-    OPEN[:] = [known for known in [*OPEN, dialog] if not sip.isdeleted(known) and known.isVisible()]
+    OPEN[:] = [one for one in [*OPEN, dialog] if not sip.isdeleted(one) and one.isVisible()]
 
 
 def push(title: str, text: str, offered: dict[str, Any], level: Any, lasts_s: int = 0) -> Any:

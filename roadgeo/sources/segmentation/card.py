@@ -229,12 +229,12 @@ def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
 
 
 def _classes(names: Any) -> dict[int, str]:
-    found = {
+    classes = {
         int(key): str(name) for key, name in (names if isinstance(names, dict) else dict(enumerate(names))).items()
     }
-    if len(found) > 1000:
-        raise ValueError(f"{len(found)} classes")
-    return found
+    if len(classes) > 1000:
+        raise ValueError(f"{len(classes)} classes")
+    return classes
 
 
 def _read_sidecar(path: Path) -> dict[str, Any]:

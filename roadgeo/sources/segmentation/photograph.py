@@ -142,9 +142,9 @@ def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
 
     meaning = dict(zip(dataset.colorinterp, dataset.indexes, strict=True))
     named = {str(text).strip().lower(): i for text, i in zip(dataset.descriptions, dataset.indexes, strict=True)}
-    for known in (named, {colour.name: i for colour, i in meaning.items()}):
-        if {"red", "green", "blue"} <= known.keys():
-            return [known["red"], known["green"], known["blue"]]
+    for names in (named, {colour.name: i for colour, i in meaning.items()}):
+        if {"red", "green", "blue"} <= names.keys():
+            return [names["red"], names["green"], names["blue"]]
     shown = [i for i, m in zip(dataset.indexes, dataset.colorinterp, strict=True) if m != ColorInterp.alpha]
     if not shown:
         raise MaskError(f"{name}: holds no band of values; give a photograph")
@@ -235,10 +235,10 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
         return _Tones(palette), box
     fills = _find_fills(name, exact, valid)
     shown = valid & ~np.any([(exact == fill).all(axis=2) for fill in fills], axis=0) if fills else valid
-    seen = sample[shown].astype(np.float64)
-    low, high = np.percentile(seen, [1, 99])
+    observed = sample[shown].astype(np.float64)
+    low, high = np.percentile(observed, [1, 99])
     is_8_bit = dataset.dtypes[bands[0] - 1] == "uint8"
-    keeps = is_8_bit and not 0 < np.ptp(np.percentile(seen, [0.5, 99.5])) < _FEW_VALUES
+    keeps = is_8_bit and not 0 < np.ptp(np.percentile(observed, [0.5, 99.5])) < _FEW_VALUES
     plain = [(fill, 255 if fill.min() > (_WHITE if keeps else high) else 0) for fill in fills]
     return _Tones(None, None if keeps else (low, high), plain), box
 

@@ -57,24 +57,24 @@ class ProbabilityMap:
         MaskError
             Nowhere.
         """
-        seen = self.values != NODATA
-        roads = (self.values > round(PROBABILITY_SURE * threshold)) & seen
+        observed = self.values != NODATA
+        roads = (self.values > round(PROBABILITY_SURE * threshold)) & observed
         if not roads.any():
             raise MaskError(f"{self.name}: no road is seen with a probability above {threshold:g}")
-        return RoadMask(roads, None if seen.all() else seen, self.name, self.values)
+        return RoadMask(roads, None if observed.all() else observed, self.name, self.values)
 
     def resized(self, shape: tuple[int, int]) -> ProbabilityMap:
         """Return the same on another grid of (H, W) pixels over the same frame."""
         if shape == self.values.shape:
             return self
-        size, seen = shape[::-1], self.values != NODATA
+        size, observed = shape[::-1], self.values != NODATA
         smaller = shape[0] < self.values.shape[0]
         way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-        values: AnyArray = cv2.resize(np.where(seen, self.values, 0).astype(np.uint8), size, interpolation=way)
-        if not seen.all():
-            known = cv2.resize(seen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            values = np.where(known > 0, np.minimum(values, PROBABILITY_SURE), NODATA).astype(np.uint8)
-        values = np.minimum(values, PROBABILITY_SURE) if seen.all() else values
+        values: AnyArray = cv2.resize(np.where(observed, self.values, 0).astype(np.uint8), size, interpolation=way)
+        if not observed.all():
+            kept = cv2.resize(observed.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+            values = np.where(kept > 0, np.minimum(values, PROBABILITY_SURE), NODATA).astype(np.uint8)
+        values = np.minimum(values, PROBABILITY_SURE) if observed.all() else values
         return replace(self, values=values, pixel=self.pixel * self.values.shape[1] / shape[1])
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -139,8 +139,8 @@ def _mean(values: Sequence[AnyArray]) -> AnyArray:
     log_odds: AnyArray = np.log(share / (1 - share)).astype(np.float32)
     total, count = np.zeros(values[0].shape, np.float32), np.zeros(values[0].shape, np.float32)
     for value in values:
-        seen = value != NODATA
-        total += np.where(seen, log_odds[value], 0)
-        count += seen
+        observed = value != NODATA
+        total += np.where(observed, log_odds[value], 0)
+        count += observed
     mean = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
     return np.where(count > 0, np.rint(PROBABILITY_SURE * mean), NODATA).astype(np.uint8)

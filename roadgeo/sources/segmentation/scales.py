@@ -34,7 +34,7 @@ _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
 _MOST_ENLARGED = 4.0  # along a side; beyond it time grows, and no more roads are seen
 _TRIED_TILES = 1.875  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
-_DOUBT = 4  # power of the share of probability that lies on roads
+_CERTAINTY_POWER = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
@@ -53,8 +53,8 @@ def try_scales(
     fitting = [scale for scale in PYRAMID if _fits(map_shape(photograph, scale), scale)]
     if not fitting:
         return (min(1.0, math.sqrt(MAX_MAP_PIXELS / (photograph.width * photograph.height))),)
-    known = tuple(scale for scale in fitting if low <= scale <= high)
-    return known or (min(fitting, key=lambda scale: max(low / scale, scale / high)),)
+    allowed = tuple(scale for scale in fitting if low <= scale <= high)
+    return allowed or (min(fitting, key=lambda scale: max(low / scale, scale / high)),)
 
 
 def _fits(shape: tuple[int, int], scale: float) -> bool:
@@ -71,13 +71,13 @@ def rank_scales(
     scales = sorted(try_scales(photograph, network, gsd_m))
     if len(scales) == 1:
         return {scales[0]: None}
-    found: dict[float, ProbabilityMap | None] = {}
-    worth: dict[float, float] = {}
+    maps: dict[float, ProbabilityMap | None] = {}
+    ranking: dict[float, float] = {}
     part, before, promise = _Part(0, 0, photograph.width, photograph.height), None, 1.0
-    most, seen_anywhere, hopeless = 0.0, 0.0, False
+    most, most_intersections, hopeless = 0.0, 0.0, False
     for scale in scales:
         if hopeless:
-            found[scale], worth[scale] = None, -scale
+            maps[scale], ranking[scale] = None, -scale
             continue
         part, same_ground = _most_roads(part, before, [round(_TRIED_TILES * side / scale) for side in network.seen])
         before, shown = None, photograph.cut(*part)
@@ -86,35 +86,35 @@ def rank_scales(
         intersections = score(before)
         promise *= (intersections + 1.0) / (score(same_ground) + 1.0)
         is_whole = (part.height, part.width) == (photograph.height, photograph.width)
-        found[scale] = before if is_whole else None
+        maps[scale] = before if is_whole else None
         cost = _COST_OF_SEARCH + (0 if is_whole else math.prod(map_shape(photograph, scale)))
-        worth[scale] = promise / math.sqrt(cost)
-        seen_anywhere = max(seen_anywhere, intersections)
+        ranking[scale] = promise / math.sqrt(cost)
+        most_intersections = max(most_intersections, intersections)
         # Finer scales are not tried beyond one that promises clearly less than the best: there roads fall apart. Those
         # of which only a part would be shown, the dearest, are tried only if the last one promises clearly more.
         is_dear = any(
             2 * scale * side > _TRIED_TILES * tile for side, tile in zip(part[:1:-1], network.seen, strict=True)
         )
         falls = promise < most + math.sqrt(most) if is_dear else promise + math.sqrt(promise) < most
-        most, hopeless = max(most, promise), seen_anywhere >= 1.0 and falls
-    if seen_anywhere < 1.0:  # narrow roads are seen at the finest scale first
-        return {scale: found[scale] for scale in reversed(scales)}
-    return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}
+        most, hopeless = max(most, promise), most_intersections >= 1.0 and falls
+    if most_intersections < 1.0:  # narrow roads are seen at the finest scale first
+        return {scale: maps[scale] for scale in reversed(scales)}
+    return {scale: maps[scale] for scale in sorted(scales, key=ranking.__getitem__, reverse=True)}
 
 
-def score(seen: ProbabilityMap | None) -> float:
+def score(probability: ProbabilityMap | None) -> float:
     """Return how much a map looks like roads: its intersections, weighted down where the model is in doubt."""
-    if seen is None:
+    if probability is None:
         return 0.0
-    known = seen.values != NODATA
-    p = np.where(known, seen.values, 0).astype(np.float32) / 254
+    observed = probability.values != NODATA
+    p = np.where(observed, probability.values, 0).astype(np.float32) / 254
     try:
-        graph = vectorize(seen.mask(seen.threshold)).graph
+        graph = vectorize(probability.mask(probability.threshold)).graph
     except MaskError:
         return 0.0
     degrees = np.bincount(np.asarray(graph.edges).ravel(), minlength=1)
-    sure = float(p[p > seen.threshold].sum() / p.sum())
-    return float(np.count_nonzero(degrees >= 3)) * sure**_DOUBT
+    sure = float(p[p > probability.threshold].sum() / p.sum())
+    return float(np.count_nonzero(degrees >= 3)) * sure**_CERTAINTY_POWER
 
 
 class _Part(NamedTuple):
@@ -126,20 +126,22 @@ class _Part(NamedTuple):
     height: int
 
 
-def _most_roads(part: _Part, seen: ProbabilityMap | None, size: Sequence[int]) -> tuple[_Part, ProbabilityMap | None]:
+def _most_roads(
+    part: _Part, probability: ProbabilityMap | None, size: Sequence[int]
+) -> tuple[_Part, ProbabilityMap | None]:
     """Return the (height, width) at most of a part where most roads were seen, and the probability there."""
     height, width = (min(side, most) for side, most in zip((part.height, part.width), size, strict=True))
-    if seen is None or (height, width) == (part.height, part.width):
+    if probability is None or (height, width) == (part.height, part.width):
         left, top = part.left + (part.width - width) // 2, part.top + (part.height - height) // 2
-        return _Part(left, top, width, height), seen
-    rows, columns = seen.values.shape
+        return _Part(left, top, width, height), probability
+    rows, columns = probability.values.shape
     y_scale, x_scale = rows / part.height, columns / part.width
     h, w = max(1, round(height * y_scale)), max(1, round(width * x_scale))
-    roads = (seen.values != NODATA) & (seen.values > PROBABILITY_SURE * seen.threshold)
+    roads = (probability.values != NODATA) & (probability.values > PROBABILITY_SURE * probability.threshold)
     sums = cv2.integral(roads.view(np.uint8))
     inside = sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]
     y, x = np.unravel_index(inside.argmax(), inside.shape) if inside.any() else (n // 2 for n in inside.shape)
     left = part.left + min(round(float(x) / x_scale), part.width - width)
     top = part.top + min(round(float(y) / y_scale), part.height - height)
-    values = np.ascontiguousarray(seen.values[y : y + h, x : x + w])
-    return _Part(left, top, width, height), replace(seen, values=values)
+    values = np.ascontiguousarray(probability.values[y : y + h, x : x + w])
+    return _Part(left, top, width, height), replace(probability, values=values)

@@ -111,7 +111,7 @@ def _segment_part(
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
     done, rest = 0, np.empty((0, shape[1]), np.float32)
-    for rows in _blend(read, shape, _seen(network, shape), partial(_look, network, ways)):
+    for rows in _blend(read, shape, _tiles_of(network, shape), partial(_look, network, ways)):
         rows = np.concatenate([rest, rows])
         n = len(rows) // step
         inside[done : done + n] = np.rint(PROBABILITY_SURE * _reduce(rows[: n * step], step))
@@ -123,8 +123,8 @@ def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:
     """Return a model's result for a tile, shown in some ways: the mean of the logits, as a probability."""
     if ways == 1:
         return network(tile)
-    seen = [network(np.ascontiguousarray(tile[::down, ::right]))[::down, ::right] for down, right in _WAYS[:ways]]
-    road = np.clip(seen, _SURE, 1 - _SURE)
+    answers = [network(np.ascontiguousarray(tile[::down, ::right]))[::down, ::right] for down, right in _WAYS[:ways]]
+    road = np.clip(answers, _SURE, 1 - _SURE)
     return np.asarray(1 / (1 + np.exp(-np.log(road / (1 - road)).mean(axis=0))), np.float32)
 
 
@@ -136,7 +136,7 @@ def _reduce(rows: Float32Array, step: int) -> Float32Array:
     return np.asarray(cv2.resize(rows, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-class _Seen(NamedTuple):
+class _Tiles(NamedTuple):
     """The visible part of a tile: its (height, width), where it begins in the tile, the tile's size, the overlap."""
 
     size: tuple[int, int]
@@ -145,13 +145,13 @@ class _Seen(NamedTuple):
     overlap: float
 
 
-def _seen(network: Network, shape: tuple[int, int]) -> _Seen:
+def _tiles_of(network: Network, shape: tuple[int, int]) -> _Tiles:
     """Return the tiles of a picture of (H, W) pixels: of free size, no more than else, and no larger than they need."""
     tile, overlap = network.card.tile, network.card.overlap
     if not network.any_size:
-        return _Seen(network.seen, network.margin, tile, overlap)
+        return _Tiles(network.seen, network.margin, tile, overlap)
     height, width = (_least(length, side, overlap) for length, side in zip(shape, tile, strict=True))
-    return _Seen((height, width), (0, 0), (height, width), overlap)
+    return _Tiles((height, width), (0, 0), (height, width), overlap)
 
 
 def _least(length: int, tile: int, overlap: float) -> int:
@@ -163,26 +163,26 @@ def _least(length: int, tile: int, overlap: float) -> int:
 def _blend(
     read: Callable[[int, int], AnyArray],
     shape: tuple[int, int],
-    seen: _Seen,
+    tiles: _Tiles,
     network: Callable[[AnyArray], Float32Array],
 ) -> Iterator[Float32Array]:
     """Yield the rows of a map from the top down, each when no further tile reaches it."""
     height, width = shape
-    size, (above, before) = seen.size, seen.margin
-    tops, lefts = _starts(height, size[0], seen.overlap), _starts(width, size[1], seen.overlap)
-    weight = _weight(size, seen.overlap)
+    size, (above, before) = tiles.size, tiles.margin
+    tops, lefts = _starts(height, size[0], tiles.overlap), _starts(width, size[1], tiles.overlap)
+    weight = _weight(size, tiles.overlap)
     total, weights = np.zeros((size[0], width), np.float32), np.zeros((size[0], width), np.float32)
     for top, next_top in zip(tops, [*tops[1:], height], strict=True):
         first = max(top - above, 0)
-        rgb = read(first, min(top - above + seen.tile[0], height) - first)
+        rgb = read(first, min(top - above + tiles.tile[0], height) - first)
         for left in lefts:
             rows, columns = min(size[0], height - top), min(size[1], width - left)
             start = max(left - before, 0)
-            part = rgb[:, start : left - before + seen.tile[1]]
+            part = rgb[:, start : left - before + tiles.tile[1]]
             if _is_empty(part):
                 road = np.zeros((rows, columns), np.float32)
             else:
-                filled = _fill(part, seen.tile, (first - (top - above), start - (left - before)))
+                filled = _fill(part, tiles.tile, (first - (top - above), start - (left - before)))
                 road = network(filled)[:rows, :columns]
             total[:rows, left : left + columns] += weight[:rows, :columns] * road
             weights[:rows, left : left + columns] += weight[:rows, :columns]
