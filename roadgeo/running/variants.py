@@ -108,17 +108,25 @@ def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
     """
 
     def locate(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
-        variant = trimmed(mask)
-        variant = variant if aspect in (None, 1.0) else stretched(variant, aspect)
-        variant = mirrored(variant) if mirror else variant
+        variant = undone(trimmed(mask))
         answer = how(variant.mask, references, options)
+        if trimmed(mask).mask is not mask and any(one.lens_k1 for one in _location_of(answer).places):
+            variant = undone(Variant(mask, np.eye(3)))  # a lens bends around the middle of the whole frame
+            answer = how(variant.mask, references, options)
         if variant.mask is mask:
             return answer
-        place = answer.location if isinstance(answer, Explanation) else answer
-        place = _stating_pixels(in_pixels_of(place, mask.shape[::-1], variant.matrix), aspect)
+        place = _stating_pixels(in_pixels_of(_location_of(answer), mask.shape[::-1], variant.matrix), aspect)
         return replace(answer, location=place) if isinstance(answer, Explanation) else place
 
+    def undone(variant: Variant) -> Variant:
+        square = variant if aspect in (None, 1.0) else stretched(variant, aspect)
+        return mirrored(square) if mirror else square
+
     return locate
+
+
+def _location_of(answer: Location | Explanation) -> Location:
+    return answer.location if isinstance(answer, Explanation) else answer
 
 
 def _stating_pixels(location: Location, aspect: float | None) -> Location:
