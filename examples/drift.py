@@ -15,7 +15,7 @@ import numpy as np
 from simulated_flights import FlightOptions, _draw_views, _motion
 
 from roadgeo._arrays import FloatArray
-from roadgeo.flights.pose import Pose, predict, start
+from roadgeo.flights.pose import FramePose, predict, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.pinhole import View
 from roadgeo.geometry.pose import _place, _starts
@@ -49,7 +49,7 @@ class Anywhere:
         return True
 
 
-def fly(number: int) -> tuple[tuple[View, ...], Pose]:
+def fly(number: int) -> tuple[tuple[View, ...], FramePose]:
     """Follow a flight by its motion alone; return its views and the last pose."""
     rng = np.random.default_rng(number)
     views = _draw_views(Anywhere(), OPTIONS, rng)

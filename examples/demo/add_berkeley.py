@@ -15,7 +15,7 @@ import geopandas as gpd
 import numpy as np
 
 import roadgeo.evaluation.demo
-from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.geopackage import FeatureTable, write_layers
 
 __all__ = ["add_berkeley"]
 
@@ -29,7 +29,9 @@ def add_berkeley(photo: str, streets: str, folder: Path) -> None:
     # The lines have a vertex for each 2.5 m; a few are enough to draw them to 0.2 m.
     lines = [np.round(line.coords, 1) for line in roads.geometry.simplify(0.2)]
     columns = {"name": roads["FULLNAME"].tolist()}
-    write_layers(folder / "berkeley_streets.gpkg", [Layer("streets", "LINESTRING", lines, columns, "EPSG:32610")])
+    write_layers(
+        folder / "berkeley_streets.gpkg", [FeatureTable("streets", "LINESTRING", lines, columns, "EPSG:32610")]
+    )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from shapely.ops import substring
 import roadgeo.evaluation.demo
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.geopackage import FeatureTable, write_layers
 
 __all__ = ["Camera", "make_demo"]
 
@@ -120,7 +120,7 @@ def make_demo(home_pbf: str, other_pbf: str, folder: Path) -> None:
     columns = {tag: [way[tag] for _, way in ways] for tag in TAGS}
     write_layers(
         folder / "porto_roads.gpkg",
-        [Layer("roads", "LINESTRING", [np.round(line, 7) for line, _ in ways], columns, "EPSG:4326")],
+        [FeatureTable("roads", "LINESTRING", [np.round(line, 7) for line, _ in ways], columns, "EPSG:4326")],
     )
     truth = [draw(camera, ways, "EPSG:32629", folder) for camera in CAMERAS]
     around = (ELSEWHERE.lon - 0.03, ELSEWHERE.lat - 0.015, ELSEWHERE.lon + 0.03, ELSEWHERE.lat + 0.015)

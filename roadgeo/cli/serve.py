@@ -126,14 +126,14 @@ def serve_command(
     from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.serving.app import Service
     from roadgeo.serving.server import Server
-    from roadgeo.serving.workers import Workers
+    from roadgeo.serving.workers import ImageWorkers
 
     # Compiled and opened here first: errors in the references are printed before anything listens.
     options = _options(given)
     maps = open_maps(references)
     # The images of strangers are opened by processes inside a fence; this one may show the page in a browser.
     fence = fence_of("serve", {"references": references}, ())
-    workers = Workers(references, options.workers, options.waiting, n_threads(options.workers), fence)
+    workers = ImageWorkers(references, options.workers, options.waiting, n_threads(options.workers), fence)
     try:
         sender = None if mavlink is None else MavlinkSender(mavlink)
         server = Server(Service(workers, maps, options, None if sender is None else partial(_tell, sender)))

@@ -19,7 +19,7 @@ from roadgeo.evaluation.scoring import share
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.geometry.warping import MapGrid
-from roadgeo.outputs.drawing.layers import Layer, Lines, Picture, rgb
+from roadgeo.outputs.drawing.layers import Bitmap, Layer, Lines, rgb
 from roadgeo.outputs.drawing.raster import FAINT, Canvas, below, beside, blank, draw_scale_bar, framed, line
 from roadgeo.roads.network import RoadNetwork
 
@@ -283,7 +283,7 @@ def draw_localizability(network: RoadNetwork, drawn_map: LocalizabilityMap, titl
     canvas = Canvas.of(box, _LONGER_PX, _LONGER_PX)
     lines = [(line - (cells.west, cells.north)) * (1.0, -1.0) for line in network.graph.polylines()]
     classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[drawn_map.classes]
-    canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])
+    canvas.draw([Layer("picture", "", [Bitmap(classes, box)]), Layer("streets", "", [Lines(lines)])])
     draw_scale_bar(canvas, 22)
     legend = []
     for value, (_, alpha, label) in list(PALETTE.items())[1:]:

@@ -38,7 +38,7 @@ from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.projection import transform
 from roadgeo.outputs.names import table_text
 from roadgeo.storage.files import write_text
-from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.geopackage import FeatureTable, write_layers
 
 __all__ = ["SCHEMA", "Truth", "read_truth", "truth_from_record", "truth_to_record", "write_truth"]
 
@@ -214,10 +214,10 @@ def _from_row(row: dict[str, str], crs: str | None) -> Truth:
     )
 
 
-def _to_layer(truths: Sequence[Truth]) -> Layer:
+def _to_layer(truths: Sequence[Truth]) -> FeatureTable:
     """Footprints as one layer, in the CRS of the first query."""
     names = list(dict.fromkeys(name for truth in truths for name in truth.properties))
-    return Layer(
+    return FeatureTable(
         "footprints",
         "POLYGON",
         [truth.footprint for truth in truths],

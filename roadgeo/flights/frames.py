@@ -81,7 +81,7 @@ class FrameOptions:
     recursive: bool = False
 
 
-class _Image(NamedTuple):
+class _FrameFile(NamedTuple):
     """A frame's file, its name, its time, and how many times its pixels are as wide as high."""
 
     path: str
@@ -140,7 +140,7 @@ def read_stills(
         As of `read_frames`.
     """
     options, last = options or FrameOptions(), _Last()
-    read: list[tuple[_Image, FlightFrame, AnyArray | None]] = []
+    read: list[tuple[_FrameFile, FlightFrame, AnyArray | None]] = []
     with ExitStack() as stack:
         for number, image in enumerate(_images(arguments, options, stack)):
             mask, grey = _read(image, options, last)
@@ -172,7 +172,7 @@ def follow_frames(
     return follow(read_frames(arguments, reading), references, options)
 
 
-def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
+def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_FrameFile]:
     """Yield frames with their times: each file begins where the one before ended."""
     if len(arguments) > 1 and list(arguments) == sorted(arguments) != sorted(arguments, key=in_natural_order):
         _LOG.warning("frames come in the order of their names as text, frame_10 before frame_2; give their folder")
@@ -185,7 +185,7 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
             begun_s = yield from _video(path, options, stack, begun_s)
         else:
             aspect = options.aspect or read_pixel_shape(path)[0] or 1.0
-            yield _Image(path, Path(path).name, times[n] if times else begun_s, aspect)
+            yield _FrameFile(path, Path(path).name, times[n] if times else begun_s, aspect)
             begun_s += options.interval_s or 1.0
 
 
@@ -219,7 +219,9 @@ def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[f
     return [paths[k] for k in order], [time - seconds[0] for time in seconds]
 
 
-def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 0.0) -> Generator[_Image, None, float]:
+def _video(
+    path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 0.0
+) -> Generator[_FrameFile, None, float]:
     """Take frames of a video that begins at a time; each is a file for as long as it is read. Return when it ends."""
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="roadgeo-"))
     video = cv2.VideoCapture(path)
@@ -254,7 +256,7 @@ def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 
         with writing(target):  # OpenCV does not report a full disk
             Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
-        yield _Image(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, aspect, stays=False)
+        yield _FrameFile(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, aspect, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
     return begun_s + at_s + step_s
@@ -270,7 +272,7 @@ def _aspect_of(video: cv2.VideoCapture, name: str) -> float:
     return aspect
 
 
-def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
+def _read(image: _FrameFile, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
     """Read a frame as a mask, and as a grey picture where it is a photograph."""
     reading = options.reading
     # A white or a black frame among photographs is no mask.
@@ -294,7 +296,7 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
         return _squared(blank, image), None
 
 
-def _squared(mask: RoadMask, image: _Image) -> RoadMask:
+def _squared(mask: RoadMask, image: _FrameFile) -> RoadMask:
     """Return a mask with square pixels."""
     if image.aspect == 1.0:
         return mask
@@ -302,7 +304,7 @@ def _squared(mask: RoadMask, image: _Image) -> RoadMask:
     return resampled(mask, (round(high * mask.shape[0]), round(wide * mask.shape[1]))).mask
 
 
-def _blank(image: _Image) -> RoadMask | None:
+def _blank(image: _FrameFile) -> RoadMask | None:
     """Return a mask without any road for a frame of one colour, which a flight may hold; None for any other."""
     from roadgeo.storage.rasters import open_raster
 
@@ -312,7 +314,7 @@ def _blank(image: _Image) -> RoadMask | None:
     return None
 
 
-def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray]:
+def _segment(image: _FrameFile, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray]:
     """Find the roads in a photograph, at the scale that its pixels have, or that served the first one best.
 
     Also returns the photograph in grey.
@@ -340,7 +342,7 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
 
 
 def _motion(
-    image: _Image, mask: RoadMask, grey: AnyArray | None, options: FrameOptions, last: _Last
+    image: _FrameFile, mask: RoadMask, grey: AnyArray | None, options: FrameOptions, last: _Last
 ) -> tuple[FloatArray | None, float]:
     """Return how a frame moved against the one before, and how far off that may put a corner, pixels."""
     if options.motion is not None:

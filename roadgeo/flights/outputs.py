@@ -16,7 +16,7 @@ from roadgeo._version import __version__
 from roadgeo.flights.rows import Row
 from roadgeo.outputs.names import table_cell, table_text
 from roadgeo.storage.files import write_text
-from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.geopackage import FeatureTable, write_layers
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
 
 __all__ = ["WRITERS", "to_csv", "to_geojson", "to_gpx", "write_geopackage"]
@@ -113,15 +113,15 @@ def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
     columns = {"frame": [row.number for row in placed], **columns, "time": [row.to_dict()["time"] for row in placed]}
     centers = np.array([row.center for row in placed])
     layers = [
-        Layer("footprints", "POLYGON", [row.footprint for row in placed], columns, "EPSG:4326",
+        FeatureTable("footprints", "POLYGON", [row.footprint for row in placed], columns, "EPSG:4326",
               draw_fill("228,87,46,25", "228,87,46", 0.3)),
-        Layer("centers", "POINT", centers, columns, "EPSG:4326", draw_marker("228,87,46", 2.0)),
+        FeatureTable("centers", "POINT", centers, columns, "EPSG:4326", draw_marker("228,87,46", 2.0)),
     ]  # fmt: skip
     runs = _runs(rows, 2)
     if runs:
         ends = {"first": [run[0].number for run in runs], "last": [run[-1].number for run in runs]}
         lines = [np.array([row.center for row in run]) for run in runs]
-        layers.insert(1, Layer("track", "LINESTRING", lines, ends, "EPSG:4326", draw_line("40,40,40", 0.6)))
+        layers.insert(1, FeatureTable("track", "LINESTRING", lines, ends, "EPSG:4326", draw_line("40,40,40", 0.6)))
     write_layers(path, layers)
 
 

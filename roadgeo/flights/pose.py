@@ -22,7 +22,7 @@ from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["FEWEST", "FilterOptions", "Pose", "correct", "predict", "start"]
+__all__ = ["FEWEST", "FilterOptions", "FramePose", "correct", "predict", "start"]
 
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
 #: The map of a slope of 10 % has a skew of 0.005.
@@ -56,7 +56,7 @@ class FilterOptions:
 
 
 @dataclass(frozen=True)
-class Pose:
+class FramePose:
     """A frame's place.
 
     Attributes
@@ -103,7 +103,7 @@ class Pose:
         return np.asarray(np.sqrt(self.covariance.diagonal()[:8].reshape(4, 2).sum(axis=1)))
 
 
-def loosened(pose: Pose, shift_m: float) -> Pose:
+def loosened(pose: FramePose, shift_m: float) -> FramePose:
     """Return a frame that may lie this far away as a whole besides: root mean square of the distance."""
     covariance = pose.covariance.copy()
     covariance[:8, :8] += 0.5 * shift_m**2 * np.tile(np.eye(2), (4, 4))
@@ -119,7 +119,7 @@ class _Local:
     unit: float
 
     @classmethod
-    def of(cls, pose: Pose) -> _Local:
+    def of(cls, pose: FramePose) -> _Local:
         diagonals = np.hypot(*(pose.corners[2:] - pose.corners[:2]).T)
         return cls(pose.frame, pose.corners.mean(axis=0), float(diagonals.mean()) / 2.0)
 
@@ -163,12 +163,12 @@ def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
     return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
 
 
-def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> Pose:
+def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> FramePose:
     """Return the pose of a frame whose corners (4, 2) are known, with their covariance (8, 8), and of a usual lens."""
-    return Pose(corners, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
+    return FramePose(corners, _beside_focal(covariance, USUAL_SIGMA**2), frame, math.log(USUAL_FOCAL))
 
 
-def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
+def predict(pose: FramePose, motion: FloatArray, sigma_px: float) -> FramePose | None:
     """Return where the next frame lies by its motion, as a camera sees it; None where that cannot be.
 
     Parameters
@@ -197,7 +197,7 @@ def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
     return np.block([[matrix, np.zeros((8, 1))], [np.zeros((1, 8)), focal]])
 
 
-def _as_cameras_see(pose: Pose) -> Pose:
+def _as_cameras_see(pose: FramePose) -> FramePose:
     """Correct a pose by a measurement: both skews of a pinhole, of a focal length that is unknown too, are 0."""
     local = _Local.of(pose)
     corners, p = local.corners, local.parameters(pose.corners)
@@ -212,7 +212,7 @@ def _as_cameras_see(pose: Pose) -> Pose:
         return pose
     back = _beside_focal(local.derivative(state[:8], corners))
     covariance = back @ (spread - gain @ rows @ spread) @ back.T
-    return Pose(local.places(state[:8], corners), (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
+    return FramePose(local.places(state[:8], corners), (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
 
 
 def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -228,7 +228,7 @@ def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
     return skews[:, 0], (skews[:, 1:10] - skews[:, 10:]) / 2e-6
 
 
-def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
+def correct(pose: FramePose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> FramePose | None:
     """Lay a frame's roads on the map's, starting from a predicted pose; None where there are too few."""
     local, gsd = _Local.of(pose), pose.gsd_m
     p = local.parameters(pose.corners)
@@ -261,7 +261,7 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     both = np.vstack((np.eye(8), follows))
     joint = both @ covariance @ both.T + np.diag([0.0] * 8 + [pose.covariance[8, 8] - follows @ before @ follows])
     log_focal = pose.log_focal + float(follows @ (placed - pose.corners).ravel())
-    return Pose(placed, (joint + joint.T) / 2.0, pose.frame, log_focal)
+    return FramePose(placed, (joint + joint.T) / 2.0, pose.frame, log_focal)
 
 
 def _road_equations(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.flights.pose import Pose
+from roadgeo.flights.pose import FramePose
 from roadgeo.flights.tracker import Tracked
 from roadgeo.geometry.pose import find_pose
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
@@ -130,7 +130,7 @@ def _row(tracked: Tracked, begun: datetime | None, focal_px: float | None) -> Ro
     )
 
 
-def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
+def _camera(pose: FramePose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
     """Find the camera of a focal length behind a frame; None where it would lie below the ground."""
     size = round(pose.frame.width), round(pose.frame.height)
     camera = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], focal_px)

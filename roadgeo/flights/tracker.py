@@ -19,7 +19,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, MosaicQuery
 from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
-from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
+from roadgeo.flights.pose import FilterOptions, FramePose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -107,7 +107,7 @@ class Tracked:
     status : str
         "located": placed by the search, alone or in a mosaic. "tracked": followed from the frame before, and the map
         agrees. "predicted": by its motion alone, hardly a road agrees. "lost": not known.
-    pose : Pose or None
+    pose : FramePose or None
         None where it is lost.
     reference : Reference or None
     log10_odds : float
@@ -121,7 +121,7 @@ class Tracked:
     status: FrameStatus
     reason: str
     known_at: int
-    pose: Pose | None = None
+    pose: FramePose | None = None
     reference: Reference | None = None
     log10_odds: float = math.nan
 
@@ -156,7 +156,7 @@ class Tracker:
         warm_up()
         self.references, self.options = list(references), options or TrackOptions()
         self.fixes: list[Fix] = []
-        self._pose: Pose | None = None
+        self._pose: FramePose | None = None
         self._reference: Reference | None = None
         self._doubtful: list[_Waiting] = []  # frames in a row that do not agree
         self._window: list[_Waiting] = []
@@ -199,7 +199,7 @@ class Tracker:
             return Tracked(frame, "lost", why, known_at)
         return self._judge(waiting, predicted, known_at, status)
 
-    def _judge(self, waiting: _Waiting, predicted: Pose, known_at: int, status: FrameStatus) -> Tracked:
+    def _judge(self, waiting: _Waiting, predicted: FramePose, known_at: int, status: FrameStatus) -> Tracked:
         frame, scene, reference = waiting.frame, waiting.scene, self._reference
         corrected = (
             None
@@ -376,7 +376,7 @@ def _read(mosaic: Mosaic) -> Query | None:
         return None
 
 
-def _odds(pose: Pose, scene: Scene, reference: Reference) -> float:
+def _odds(pose: FramePose, scene: Scene, reference: Reference) -> float:
     """Return the log10 odds of a frame at its place against places nearby."""
     matrix = pose.homography.matrix @ PIXEL_TO_PLANE
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no

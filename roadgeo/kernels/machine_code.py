@@ -32,7 +32,7 @@ _MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "log", "lo
 _IN_EVERY_PROCESS = _C | {*_MATH, *(f"{name}f" for name in _MATH)}
 
 
-class Kernel(Protocol):
+class Compilable(Protocol):
     """A function to be compiled (see `compilation.Kernel`)."""
 
     name: str
@@ -48,7 +48,7 @@ class CannotKeep(Exception):  # noqa: N818
     """Machine code that would not run without numba."""
 
 
-def compile_kernels(kernels: Sequence[Kernel], llvm: Any, machine: Any, progress: Callable[[int], None]) -> bytes:
+def compile_kernels(kernels: Sequence[Compilable], llvm: Any, machine: Any, progress: Callable[[int], None]) -> bytes:
     """Compile kernels into one object file; `progress` is called with the number done.
 
     Raises
@@ -94,7 +94,7 @@ def _numba_type(kind: Kind) -> Any:
     return {float: types.float64, int: types.int64, bool: types.boolean, None: types.none}[kind]
 
 
-def _entry(kernel: Kernel, made: Any) -> ir.Module:
+def _entry(kernel: Compilable, made: Any) -> ir.Module:
     """Write the entry that calls a compiled kernel."""
     context = cpu_target.target_context
     module = context.create_module(f"roadgeo.{kernel.name}")

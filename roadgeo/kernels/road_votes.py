@@ -11,7 +11,7 @@ from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes
 from roadgeo.kernels.road_rings import BEARINGS, WORDS, count_bits, turn_bits
 
-__all__ = ["MAX_TURNS", "WHOLE_TURN", "Places", "RoadPoints", "Trial", "find_turns", "improve_votes", "vote"]
+__all__ = ["MAX_TURNS", "WHOLE_TURN", "Places", "RoadPoints", "VoteRates", "find_turns", "improve_votes", "vote"]
 
 #: Angles of branches are whole numbers: bits beyond a whole turn fall away, and the uppermost 6 bits of 32 are the
 #: bearing that they point to.
@@ -53,7 +53,7 @@ class RoadPoints(NamedTuple):
     angles: Floats1
 
 
-class Trial(NamedTuple):
+class VoteRates(NamedTuple):
     """Share of points that meet roads at the right place, and by chance, in units of the density of roads there."""
 
     hit_rate: float
@@ -302,7 +302,7 @@ def improve_votes(
     points: RoadPoints,
     places: Places,
     raster: Raster,
-    trial: Trial,
+    trial: VoteRates,
 ) -> None:
     """Vary the turn and scale of each proposal in small steps, with more points, and score it anew.
 

@@ -27,7 +27,7 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.kernels.road_growth import Stages, grow_by_roads
 from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, measure_tiles, paint_roads
 from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
-from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, Trial, improve_votes, vote
+from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import denormalise
@@ -171,7 +171,7 @@ _LEAST_POINTS = 15
 _KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 100, 160, 260.0
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
-_TRIAL = Trial(0.55, 1.5)
+_TRIAL = VoteRates(0.55, 1.5)
 
 
 @dataclass(frozen=True)

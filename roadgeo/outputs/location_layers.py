@@ -16,7 +16,7 @@ from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.placing import map_roads
 from roadgeo.outputs.subject import Subject
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.storage.geopackage import Layer, dump_layers
+from roadgeo.storage.geopackage import FeatureTable, dump_layers
 from roadgeo.storage.qml import draw_arrow, draw_fill, draw_line, draw_marker
 
 __all__ = ["write_geopackage"]
@@ -40,19 +40,19 @@ def write_geopackage(path: Path, subject: Subject) -> None:
     dump_layers(path, _layers(subject))
 
 
-def _layers(subject: Subject) -> list[Layer]:
+def _layers(subject: Subject) -> list[FeatureTable]:
     place, matches = subject.place, subject.place.matches
     columns = {name: [value] for name, value in attributes(subject.location.to_dict()).items()}
     text = "Ground that the image shows"
     return [
-        Layer("footprint", "POLYGON", [place.footprint], columns, place.crs, _FOOTPRINT_STYLE, text),
+        FeatureTable("footprint", "POLYGON", [place.footprint], columns, place.crs, _FOOTPRINT_STYLE, text),
         *([] if matches is None else _match_layers(place, subject.graph, matches)),
         _corner_layer(place),
         _alternative_layer(place, subject.location),
     ]
 
 
-def _match_layers(place: Placement, graph: RoadGraph, matches: Matches) -> list[Layer]:
+def _match_layers(place: Placement, graph: RoadGraph, matches: Matches) -> list[FeatureTable]:
     """Draw the mask's roads on the map, its matched intersections where the map has them, and the way between both."""
     lines, pixels = map_roads(place, graph), plane_to_pixel(matches.query_xy)
     start, end = place.to_crs(pixels), matches.reference_xy
@@ -66,9 +66,9 @@ def _match_layers(place: Placement, graph: RoadGraph, matches: Matches) -> list[
     )
     length = {"length_m": _lengths(lines)}
     return [
-        Layer("query_roads", "LINESTRING", lines, length, place.crs, _ROADS_STYLE, texts[0]),
-        Layer("residuals", "LINESTRING", arrows, apart, place.crs, _RESIDUALS_STYLE, texts[1]),
-        Layer("matches", "POINT", end, {**where, **apart}, place.crs, _MATCHES_STYLE, texts[2]),
+        FeatureTable("query_roads", "LINESTRING", lines, length, place.crs, _ROADS_STYLE, texts[0]),
+        FeatureTable("residuals", "LINESTRING", arrows, apart, place.crs, _RESIDUALS_STYLE, texts[1]),
+        FeatureTable("matches", "POINT", end, {**where, **apart}, place.crs, _MATCHES_STYLE, texts[2]),
     ]
 
 
@@ -82,7 +82,7 @@ def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(np.add.reduceat(steps, starts[:-1]))
 
 
-def _corner_layer(place: Placement) -> Layer:
+def _corner_layer(place: Placement) -> FeatureTable:
     """Show the corners of the frame, each with the covariance of its position."""
     sigma, covariance = place.corner_sigma_m, place.corner_covariance_m2
     covariance = np.full((8, 8), np.nan) if covariance is None else covariance
@@ -94,14 +94,14 @@ def _corner_layer(place: Placement) -> Layer:
         "var_y_m2": covariance.diagonal()[1::2],
     }
     summary = "Corners of the frame; how far each may be off, and the covariance of its x and y"
-    return Layer("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, summary)
+    return FeatureTable("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, summary)
 
 
-def _alternative_layer(place: Placement, location: Location) -> Layer:
+def _alternative_layer(place: Placement, location: Location) -> FeatureTable:
     """Show where else the mask might lie."""
     others = location.alternatives
     values = np.array([(*other.center_in(place.crs), other.score) for other in others], float).reshape(-1, 5)
     columns = dict(zip(("lon", "lat", "log10_odds"), values.T[2:], strict=True))
     columns = {"rank": np.arange(2, 2 + len(others)), **columns}
     text = "Middles of the best other places, with their scores"
-    return Layer("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)
+    return FeatureTable("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)

@@ -406,7 +406,7 @@ def _cut_up(grid: MapGrid) -> Iterator[tuple[int, int, tuple[int, int]]]:
             yield column, row, (min(_BLOCK, grid.width - column), min(_BLOCK, grid.height - row))
 
 
-class _Part(NamedTuple):
+class _Block(NamedTuple):
     """A window of a picture: (rows, columns, bands), and where they are known; None: everywhere."""
 
     window: Window
@@ -414,7 +414,7 @@ class _Part(NamedTuple):
     valid: BoolArray | None
 
 
-def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Part:
+def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Block:
     """Read what a block needs."""
     window = _source_window(plan, pixels, inside)
     shape, palette = _reduced_shape(plan, window), plan.palette
@@ -423,10 +423,10 @@ def _read_part(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> _Part:
     plan.picture.read(plan.bands, window=window, out=np.moveaxis(values, 2, 0), resampling=averaged)
     if palette is not None:
         values = palette[values[..., 0]]
-    return _Part(window, values, plan.valid(window, shape[:2]))
+    return _Block(window, values, plan.valid(window, shape[:2]))
 
 
-def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: AnyArray) -> AnyArray:
+def _draw_block(plan: _Plan, part: _Block, pixels: FloatArray, inside: AnyArray) -> AnyArray:
     window, values, valid = part
     across, along = values.shape[1] / window.width, values.shape[0] / window.height
     from_center = [[across, 0.0, -across * window.col_off - 0.5], [0.0, along, -along * window.row_off - 0.5]]

@@ -27,7 +27,7 @@ from roadgeo.outputs.drawing.raster import (
 )
 from roadgeo.outputs.drawing.views import STILL, Window, frame_layers, mask_layer, place_layers
 from roadgeo.outputs.names import bare_name
-from roadgeo.outputs.subject import Subject, ViewOptions
+from roadgeo.outputs.subject import Subject, ViewLimits
 from roadgeo.outputs.wording import format_lonlat, write_sigma
 
 __all__ = ["MAP_PX", "MASK_SHARE", "draw_overlay", "write_overlay"]
@@ -44,7 +44,7 @@ MAP_PX, _MARGIN, MASK_SHARE = 1400, 0.14, 0.6
 
 def write_overlay(path: Path, subject: Subject) -> None:
     """Write `draw_overlay` as PNG."""
-    write_png(path, draw_overlay(replace(subject, views=ViewOptions(picture_px=MAP_PX))))
+    write_png(path, draw_overlay(replace(subject, views=ViewLimits(picture_px=MAP_PX))))
 
 
 def draw_overlay(subject: Subject, map_px: int = MAP_PX) -> AnyArray:

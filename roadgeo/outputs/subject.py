@@ -29,7 +29,7 @@ from roadgeo.outputs.placing import placement_of
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
-__all__ = ["Match", "Subject", "ViewOptions"]
+__all__ = ["Match", "Subject", "ViewLimits"]
 
 #: Rows and columns of the grid of control points, from corner to corner.
 _GRID = 5
@@ -39,7 +39,7 @@ _MASK_MAX_PIXELS = 100_000_000
 
 
 @dataclass(frozen=True)
-class ViewOptions:
+class ViewLimits:
     """How much the views of a result hold.
 
     Attributes
@@ -104,7 +104,7 @@ class Subject:
         The maps that were searched.
     explanation : Explanation or None
         Given where one was asked for.
-    views : ViewOptions
+    views : ViewLimits
         How much pages and pictures show.
     """
 
@@ -115,7 +115,7 @@ class Subject:
     photo: Path | None = None
     indexes: Sequence[ReferenceIndex] = ()
     explanation: Explanation | None = None
-    views: ViewOptions = field(default_factory=ViewOptions)
+    views: ViewLimits = field(default_factory=ViewLimits)
 
     @property
     def picture(self) -> Path:

@@ -13,7 +13,7 @@ from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.names import bare_names, table_cell, table_text
 from roadgeo.storage.files import write_text
-from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
+from roadgeo.storage.geopackage import FeatureTable, GeometryType, write_layers
 from roadgeo.storage.qml import draw_fill
 
 __all__ = ["write_summary"]
@@ -56,8 +56,8 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
     footprints = {name: [row[name] for row in rows] for name in (*WORDS, *NUMBERS)}
     geopackage, table = folder / "roadgeo_summary.gpkg", folder / "roadgeo_summary.csv"
     layers = [
-        Layer("footprints", *shapes, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
-        Layer("others", columns={name: [document.get(name) for document in others] for name in WORDS}),
+        FeatureTable("footprints", *shapes, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
+        FeatureTable("others", columns={name: [document.get(name) for document in others] for name in WORDS}),
     ]
     write_layers(geopackage, layers)
     write_text(table, _to_csv(documents))

@@ -9,7 +9,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.outputs.drawing import layers as drawn
-from roadgeo.outputs.drawing.layers import Color, Dots, Lines, Picture
+from roadgeo.outputs.drawing.layers import Bitmap, Color, Dots, Lines
 from roadgeo.outputs.drawing.raster import Canvas, write_png
 from roadgeo.outputs.drawing.views import mask_picture
 from roadgeo.outputs.orthophoto import read_preview
@@ -17,7 +17,7 @@ from roadgeo.outputs.registry import VECTORIZED
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
 from roadgeo.storage.files import make_folder, replacing
-from roadgeo.storage.geopackage import PIXELS, Layer, write_layers
+from roadgeo.storage.geopackage import PIXELS, FeatureTable, write_layers
 from roadgeo.storage.qml import draw_line, draw_marker
 
 __all__ = ["draw_vectorized", "write_vectorized"]
@@ -79,9 +79,9 @@ def write_vectorized(
     return [package, picture]
 
 
-def _layers(graph: RoadGraph, intersections: Intersections, coarser: float) -> list[Layer]:
+def _layers(graph: RoadGraph, intersections: Intersections, coarser: float) -> list[FeatureTable]:
     """Return the two layers, styled. From a corner of the frame, where both planes have their origin, all is scaled."""
-    roads = Layer(
+    roads = FeatureTable(
         "roads",
         "LINESTRING",
         [coarser * line for line in graph.polylines()],
@@ -95,7 +95,7 @@ def _layers(graph: RoadGraph, intersections: Intersections, coarser: float) -> l
         draw_line("255,190,40", 0.5),
         "Centre lines of the roads; x = column, y = -row, pixels",
     )
-    nodes = Layer(
+    nodes = FeatureTable(
         "intersections",
         "POINT",
         coarser * intersections.xy,
@@ -130,13 +130,13 @@ def draw_vectorized(
     if ground is not None:
         paler = ground.copy()
         paler[..., 3] = (paler[..., 3] * (1.0 - _PALER)).astype(np.uint8)
-        canvas.draw([drawn.Layer("picture", "", [Picture(paler, box)])])
+        canvas.draw([drawn.Layer("picture", "", [Bitmap(paler, box)])])
     picture = mask_picture(mask, _GREY if ground is None else _SEEN, _MAX_SIDE)
     if ground is not None:
         picture[..., 3] //= 3
     canvas.draw(
         [
-            drawn.Layer("picture", "", [Picture(picture, box)]),
+            drawn.Layer("picture", "", [Bitmap(picture, box)]),
             drawn.Layer("query-roads", "", [Lines([plane_to_pixel(line) for line in graph.polylines()])]),
             drawn.Layer("branches", "", [Lines([plane_to_pixel(ray) for ray in rays])]),
             drawn.Layer("matches", "", [Dots(plane_to_pixel(intersections.xy))]),

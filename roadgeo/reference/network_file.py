@@ -30,7 +30,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer, require_tables
+from roadgeo.storage.geopackage import FeatureTable, add_layers, open_read_only, read_layer, require_tables
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, name_features, seen_from, widen_by
 
 __all__ = [
@@ -126,7 +126,7 @@ def write_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> N
         aliases = {name: alias for name, alias in _ALIASES[layer.name].items() if name in layer.columns}
         layers.append(replace(layer, style=_with_aliases(layer.style, aliases)))
     layers.append(
-        Layer(
+        FeatureTable(
             "roadgeo_meta",
             columns={"key": list(meta), "value": [_to_json(value) for value in meta.values()]},
             description="What roadgeo knows about this reference, JSON by key",
@@ -246,12 +246,12 @@ def computed_digest(path: str | os.PathLike[str]) -> str:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _map_layers(network: RoadNetwork) -> list[Layer]:
+def _map_layers(network: RoadNetwork) -> list[FeatureTable]:
     """Layers in the order in which they are drawn, the lowest first."""
     graph, detected, plane = network.graph, network.intersections, network.plane
     # Each: name, kind of geometry, geometries, columns, CRS, style, description.
     return [
-        Layer(
+        FeatureTable(
             "coverage",
             "POLYGON",
             [plane.to_crs(ring) for ring in network.coverage],
@@ -260,7 +260,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             draw_fill("120,144,156,18", "120,144,156", 0.4),
             "Where the map knows roads at all",
         ),
-        Layer(
+        FeatureTable(
             "roads",
             "LINESTRING",
             np.split(plane.to_crs(graph.coords), graph.offsets[1:-1]) if graph.n_edges else [],
@@ -275,7 +275,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             "Roads noded at every crossing, as a mask shows them",
         ),
         _tangent_layer(detected, plane),
-        Layer(
+        FeatureTable(
             "intersections",
             "POINT",
             plane.to_crs(detected.xy),
@@ -304,13 +304,13 @@ def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
     }
 
 
-def _tangent_layer(intersections: Intersections, plane: LocalPlane) -> Layer:
+def _tangent_layer(intersections: Intersections, plane: LocalPlane) -> FeatureTable:
     """Draw each tangent as a short line through its intersection."""
     row, column = np.nonzero(np.isfinite(intersections.tangents))
     angle = intersections.tangents[row, column].astype(float)
     half = 0.5 * _TANGENT_LINE_M * np.column_stack([np.cos(angle), np.sin(angle)])
     centre = plane.to_crs(intersections.xy[row])
-    return Layer(
+    return FeatureTable(
         "tangents",
         "LINESTRING",
         list(np.stack([centre - half, centre + half], axis=1)),

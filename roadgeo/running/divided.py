@@ -75,7 +75,7 @@ class _Parts(NamedTuple):
     against: float
 
 
-class _Answer(NamedTuple):
+class _PartAnswer(NamedTuple):
     """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part."""
 
     location: Location
@@ -119,7 +119,7 @@ def _size(part: Part) -> int:
 
 
 def _locate(
-    pool: Pool[_Parts, _Answer],
+    pool: Pool[_Parts, _PartAnswer],
     workers: Callable[[], Sequence[str]],
     sizes: Mapping[str, int],
     mask: RoadMask,
@@ -138,7 +138,7 @@ def _locate(
     limits = replace(options.search, time_limit_s=max(options.search.time_limit_s - query.seconds.vectorize, 0.0))
     options, here = replace(options, search=limits), workers()
 
-    def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> list[_Answer]:
+    def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> list[_PartAnswer]:
         asked = []
         for worker, names in searched.items():
             share = larger(sum(sizes.values())) / larger(sum(sizes[name] for name in names))
@@ -161,14 +161,14 @@ def _locate(
     return search({next(iter(owners(chosen[:1], here))): chosen}, options)[0].location
 
 
-def _answer_of(answer: _Answer | Lost, query: Query) -> _Answer:
+def _answer_of(answer: _PartAnswer | Lost, query: Query) -> _PartAnswer:
     """Refuse to answer without a part of the map."""
     if isinstance(answer, Lost):
         raise RoadgeoError(f"{query.name}: a part of the map has no answer: {answer.said}")
     return answer
 
 
-def _rank(answer: _Answer) -> tuple[bool, float]:
+def _rank(answer: _PartAnswer) -> tuple[bool, float]:
     odds = answer.location.log10_odds
     return answer.location.status != "not_located", -math.inf if odds is None else odds
 
@@ -204,7 +204,7 @@ class _Searcher:
 
     parts: Mapping[str, Part]
 
-    def __call__(self, asked: _Parts) -> _Answer:
+    def __call__(self, asked: _Parts) -> _PartAnswer:
         """Search parts together."""
         query, names, options = asked.query, asked.names, asked.options
         parts = [self.parts[name] for name in names]
@@ -214,7 +214,7 @@ class _Searcher:
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
         strong = [place for result in searched for place in result.compared if place.score >= least]
         places = [(place.score, by_path[_path(place.index)]) for place in strong]
-        return _Answer(decide(query, searched, options), places, names)
+        return _PartAnswer(decide(query, searched, options), places, names)
 
 
 def _path(part: Any) -> str:

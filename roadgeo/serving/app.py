@@ -30,7 +30,7 @@ from roadgeo.serving.page import page_file, page_text, policy_of
 from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.serving.view import KEPT, OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
-from roadgeo.serving.workers import ImageRequest, Reply, Workers
+from roadgeo.serving.workers import ImageRequest, ImageWorkers, Reply
 
 __all__ = ["Service"]
 
@@ -58,7 +58,7 @@ class Service:
 
     def __init__(
         self,
-        workers: Workers,
+        workers: ImageWorkers,
         references: Sequence[AnyReference],
         options: ServeOptions,
         listener: Listener | None = None,

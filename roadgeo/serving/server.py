@@ -13,7 +13,7 @@ import uvicorn
 
 from roadgeo._version import __version__
 from roadgeo.serving.app import Service
-from roadgeo.serving.workers import Workers
+from roadgeo.serving.workers import ImageWorkers
 
 __all__ = ["Server"]
 
@@ -86,7 +86,7 @@ class Server:
 class _Uvicorn(uvicorn.Server):
     """Ends the processes before it waits for their answers: clients that still wait are asked to come again."""
 
-    def __init__(self, config: uvicorn.Config, workers: Workers) -> None:
+    def __init__(self, config: uvicorn.Config, workers: ImageWorkers) -> None:
         super().__init__(config)
         self._workers = workers
 

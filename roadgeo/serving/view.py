@@ -28,7 +28,7 @@ from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
-from roadgeo.outputs.subject import Subject, ViewOptions
+from roadgeo.outputs.subject import Subject, ViewLimits
 from roadgeo.reference.opening import AnyReference
 from roadgeo.running.passes import Sighting
 from roadgeo.storage.files import replacing
@@ -80,7 +80,7 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     folder.mkdir(exist_ok=True)
     indexes = [reference.index_of(location) for reference in references]
     photo = path if sighting.of_photograph else None
-    views = ViewOptions(picture_px=_SIDE)
+    views = ViewLimits(picture_px=_SIDE)
     shown = Subject(location, sighting.mask, output_paths(folder, ""), photo=photo, indexes=indexes, views=views)
     picture = read_preview(path, _SIDE)[..., :3]
     (folder / PICTURE).write_bytes(encode(picture, Path(PICTURE).suffix, cv2.IMWRITE_JPEG_QUALITY, _QUALITY))

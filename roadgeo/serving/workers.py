@@ -25,7 +25,7 @@ from roadgeo.running.pool import Died, Ended, Lost, Pool
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
 
-__all__ = ["Full", "ImageRequest", "Reply", "Serving", "Workers"]
+__all__ = ["Full", "ImageRequest", "ImageWorkers", "Reply", "Serving"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ class Reply:
     lacks_view: bool = False
 
 
-class Workers:
+class ImageWorkers:
     """Processes, each with its references open, and a network for photographs that is loaded.
 
     Attributes

@@ -20,7 +20,7 @@ from roadgeo.storage.rasters import open_raster, page_of, sidecar_nodata
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "Choice", "Raster", "open_bands"]
+__all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "Bands", "Choice", "open_bands"]
 
 #: Tags that mark our own maps of probability among masks that users made, and the threshold of their model.
 PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
@@ -54,7 +54,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Raster:
+class Bands:
     """A raster's values, not necessarily in memory. Dimensions: H rows, W columns, B bands (alpha left out).
 
     Attributes
@@ -97,7 +97,7 @@ class Raster:
 
 
 @contextmanager
-def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: str | None) -> Iterator[Raster]:
+def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: str | None) -> Iterator[Bands]:
     """Open a file or an array (H, W) or (H, W, bands).
 
     Raises
@@ -112,7 +112,7 @@ def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: 
         yield _of_dataset(dataset, choice, name or os.fspath(source), sidecar_nodata(source))
 
 
-def _of_array(array: AnyArray, choice: Choice, name: str) -> Raster:
+def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
     """Wrap an (H, W) or (H, W, bands) array."""
     if array.ndim not in (2, 3) or array.dtype.kind not in "biuf" or array.size == 0:
         raise MaskError(
@@ -133,10 +133,10 @@ def _of_array(array: AnyArray, choice: Choice, name: str) -> Raster:
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
     bands = tuple(labels[i] for i in chosen)
-    return Raster(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen)
+    return Bands(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen)
 
 
-def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Raster:
+def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Bands:
     """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
     from rasterio.enums import ColorInterp, MaskFlags
     from rasterio.windows import Window
@@ -175,7 +175,7 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
     size, own = (dataset.height, dataset.width), _model_threshold(dataset)
-    return Raster(name, size, read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
+    return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
 
 
 def _model_threshold(dataset: DatasetReader) -> float | None:

@@ -30,7 +30,7 @@ from roadgeo.roads.thresholds import (
     spread_probability,
 )
 from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.bands import Choice, Raster, open_bands
+from roadgeo.sources.bands import Bands, Choice, open_bands
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
 
 __all__ = ["MaskSource", "is_photograph", "open_mask", "read_mask"]
@@ -107,7 +107,7 @@ class MaskSource:
     """
 
     thresholds: tuple[float, ...]
-    _raster: Raster
+    _raster: Bands
     _channel: int
     _voids: bool
     _levels: tuple[float, float] | None  # a soft map's values of ground and of road
@@ -177,7 +177,7 @@ def is_photograph(source: str | os.PathLike[str] | AnyArray) -> bool:
         return False
 
 
-def _interpret(raster: Raster, choice: Choice, threshold: float | None, voids: bool) -> MaskSource:
+def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bool) -> MaskSource:
     """Choose the band, and the thresholds above which its values are road."""
     _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
     own = raster.model_threshold
@@ -211,7 +211,7 @@ def _interpret(raster: Raster, choice: Choice, threshold: float | None, voids: b
     return MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, observed, channel, choice))
 
 
-def _part_of(raster: Raster, observed: AnyArray, channel: int, choice: Choice) -> str:
+def _part_of(raster: Bands, observed: AnyArray, channel: int, choice: Choice) -> str:
     """Return which band of (n, B) values is read, and which class, where there are others."""
     total, are_alike = len(raster.all_bands), not raster.is_chosen and (observed == observed[:, :1]).all()
     band = "" if total < 2 or are_alike else f"band {raster.bands[channel]} of {total}"
@@ -220,7 +220,7 @@ def _part_of(raster: Raster, observed: AnyArray, channel: int, choice: Choice) -
     )
 
 
-def _drawn(raster: Raster, observed: AnyArray, hidden: AnyArray) -> Raster:
+def _drawn(raster: Bands, observed: AnyArray, hidden: AnyArray) -> Bands:
     """Take what shows roads by being there, or by not being there, for roads.
 
     The first are opaque pixels of one dark colour: black roads on transparent ground; or pixels of one value, or of one
@@ -250,17 +250,17 @@ def _drawn(raster: Raster, observed: AnyArray, hidden: AnyArray) -> Raster:
     return _changed(raster, lambda values, _: (values, None))
 
 
-def _changed(raster: Raster, change: Callable[[AnyArray, BoolArray | None], _Rows]) -> Raster:
+def _changed(raster: Bands, change: Callable[[AnyArray, BoolArray | None], _Rows]) -> Bands:
     """Return a raster whose rows are changed as they are read."""
     return replace(raster, read=lambda *rows: change(*raster.read(*rows)))
 
 
-def _where(raster: Raster, observed: bool) -> Raster:
+def _where(raster: Bands, observed: bool) -> Bands:
     """Take the pixels of a raster that were observed for roads, or those that were not."""
     return _changed(raster, lambda *read: ((_finite(*read) == observed).view(np.uint8)[..., None], None))
 
 
-def _of_class(raster: Raster, number: int) -> Raster:
+def _of_class(raster: Bands, number: int) -> Bands:
     """Take the pixels of one class for roads.
 
     Raises
@@ -277,7 +277,7 @@ def _of_class(raster: Raster, number: int) -> Raster:
     return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
 
 
-def _without_fill(raster: Raster, observed: AnyArray) -> Raster:
+def _without_fill(raster: Bands, observed: AnyArray) -> Bands:
     """Leave out pixels of a value that lies far from all others, and does not look like roads: nodata by no name.
 
     (n, B) values of a sample were observed.
@@ -294,7 +294,7 @@ def _without_fill(raster: Raster, observed: AnyArray) -> Raster:
     return raster
 
 
-def _of_colours(raster: Raster) -> Raster:
+def _of_colours(raster: Bands) -> Bands:
     """Take all but black for road where each road has a colour of its own."""
     if len(raster.bands) == 1:
         return raster
@@ -314,7 +314,7 @@ def _all_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:
     return values, not_fill if valid is None else not_fill & valid
 
 
-def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]:
+def _without_unlabelled(raster: Bands, sample: Sample) -> tuple[Bands, Sample]:
     """Leave out pixels without a label in a map of labels, and report how its values were read."""
     unlabelled, reason = find_unlabelled(sample)
     if reason:
@@ -331,7 +331,7 @@ def _without_unlabelled(raster: Raster, sample: Sample) -> tuple[Raster, Sample]
     return labelled, replace(sample, observed=rest, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
 
 
-def _sample(raster: Raster) -> tuple[AnyArray, AnyArray]:
+def _sample(raster: Bands) -> tuple[AnyArray, AnyArray]:
     """Return (n, B) values from all over a raster, those observed and the others."""
     step = math.ceil(math.sqrt(raster.shape[0] * raster.shape[1] / _SAMPLE_PIXELS))
     parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
@@ -340,7 +340,7 @@ def _sample(raster: Raster) -> tuple[AnyArray, AnyArray]:
     return values[finite], values[~finite]
 
 
-def _middle(raster: Raster) -> tuple[AnyArray, BoolArray | None]:
+def _middle(raster: Bands) -> tuple[AnyArray, BoolArray | None]:
     """Read the rows in the middle of a raster: (rows, columns, B), and where they are valid."""
     height, width = raster.shape
     rows = min(height, max(_MIDDLE_PIXELS // width, MIN_SIDE))
@@ -355,7 +355,7 @@ def _numbers(values: AnyArray, valid: BoolArray | None, channel: int) -> AnyArra
     return chosen if finite.all() else np.where(finite, chosen, chosen[finite].min() if finite.any() else 0)
 
 
-def _separate(raster: Raster, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
+def _separate(raster: Bands, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
     """Return where values of a band lie above the threshold, and where they are valid."""
     roads, limit = np.zeros(raster.shape, np.bool_), float(threshold)
     observed = None
@@ -375,7 +375,7 @@ def _separate(raster: Raster, channel: int, threshold: float) -> tuple[BoolArray
     return roads, observed
 
 
-def _between(raster: Raster, channel: int, ground: float, road: float) -> AnyArray:
+def _between(raster: Bands, channel: int, ground: float, road: float) -> AnyArray:
     """Return where values of a band lie between ground and road, as `RoadMask.probability`."""
     shares = np.full(raster.shape, PROBABILITY_UNKNOWN, np.uint8)
     for strip in _strips(raster, 1):
@@ -386,7 +386,7 @@ def _between(raster: Raster, channel: int, ground: float, road: float) -> AnyArr
     return shares
 
 
-def _strips(raster: Raster, step: int) -> Iterator[slice]:
+def _strips(raster: Bands, step: int) -> Iterator[slice]:
     """Cut the rows into strips that are read at a time, each of a multiple of `step` rows."""
     height, width = raster.shape
     rows = step * max(1, _STRIP_PIXELS // (width * len(raster.bands) * step))
@@ -439,7 +439,7 @@ def _require_size(name: str, height: int, width: int, most: int) -> None:
         )
 
 
-def _require_mask(raster: Raster) -> None:
+def _require_mask(raster: Bands) -> None:
     """Refuse what has more pixels or bands than a mask, as a photograph if its middle rows look like one."""
     if max(raster.shape) <= MAX_SIDE and raster.n_unread == 0:
         return

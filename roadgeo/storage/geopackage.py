@@ -27,8 +27,8 @@ from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
     "PIXELS",
+    "FeatureTable",
     "GeometryType",
-    "Layer",
     "add_layers",
     "dump_layers",
     "layer_names",
@@ -51,7 +51,7 @@ _ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
 
 
 @dataclass(frozen=True)
-class Layer:
+class FeatureTable:
     """One table. Dimension: N features.
 
     Attributes
@@ -81,7 +81,7 @@ class Layer:
     indexed: bool = True
 
 
-def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
+def write_layers(path: str | os.PathLike[str], layers: Sequence[FeatureTable]) -> None:
     """Write a new GeoPackage, replacing what stood there in one step.
 
     Raises
@@ -95,7 +95,7 @@ def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
         dump_layers(temporary, layers)
 
 
-def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
+def dump_layers(path: Path, layers: Sequence[FeatureTable]) -> None:
     """Write a new GeoPackage as it comes: for files that are staged already.
 
     Raises
@@ -116,7 +116,7 @@ def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
 
 
 def add_layers(
-    database: sqlite3.Connection, layers: Sequence[Layer], advance: Callable[[float], None] = lambda _: None
+    database: sqlite3.Connection, layers: Sequence[FeatureTable], advance: Callable[[float], None] = lambda _: None
 ) -> None:
     """Make a GeoPackage of an empty database: for writers that add tables of their own to it.
 
@@ -221,7 +221,7 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _srs_ids(layers: Sequence[Layer]) -> dict[str, int]:
+def _srs_ids(layers: Sequence[FeatureTable]) -> dict[str, int]:
     """Return a number for each CRS: its EPSG code, else upwards from `_CUSTOM_SRS_ID`."""
     used = dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)])
     codes = {crs: -1 if crs == PIXELS else _describe_crs(crs)[1] for crs in used}
@@ -240,7 +240,7 @@ def _describe_crs(crs: str) -> tuple[str, int | None, str]:
         raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error
 
 
-def _add_layer(database: sqlite3.Connection, layer: Layer, srs_id: int) -> None:
+def _add_layer(database: sqlite3.Connection, layer: FeatureTable, srs_id: int) -> None:
     """Make the table of a layer with its rows, and with its spatial index."""
     kind, types = layer.geometry_type, {name: _sql_type(values) for name, values in layer.columns.items()}
     declared = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]

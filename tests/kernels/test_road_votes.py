@@ -10,10 +10,19 @@ from naive import road_votes as naive
 
 from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster
 from roadgeo.kernels.road_rings import BEARINGS, RINGS, WORDS, draw_rings, mark_rings
-from roadgeo.kernels.road_votes import MAX_TURNS, WHOLE_TURN, Places, RoadPoints, Trial, find_turns, improve_votes, vote
+from roadgeo.kernels.road_votes import (
+    MAX_TURNS,
+    WHOLE_TURN,
+    Places,
+    RoadPoints,
+    VoteRates,
+    find_turns,
+    improve_votes,
+    vote,
+)
 
 TOLERANCE = math.radians(20)
-TRIAL = Trial(0.6, 1.2)
+TRIAL = VoteRates(0.6, 1.2)
 angles = st.lists(st.floats(-math.pi, math.pi), min_size=2, max_size=5)
 
 

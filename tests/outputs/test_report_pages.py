@@ -29,7 +29,7 @@ from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.report import Entry, render_batch, write_batch
 from roadgeo.outputs.report.page import render_report as render_subject
-from roadgeo.outputs.subject import Subject, ViewOptions
+from roadgeo.outputs.subject import Subject, ViewLimits
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
@@ -72,11 +72,11 @@ def render_report(
     index: ReferenceIndex,
     attribution: str = "",
     picture: Path | None = None,
-    options: ViewOptions | None = None,
+    options: ViewLimits | None = None,
 ) -> str:
     """Its page."""
     index = replace(index, meta={**index.meta, "attribution": attribution})
-    views = options or ViewOptions()
+    views = options or ViewLimits()
     return render_subject(Subject(location, mask, output_paths("", "a"), photo=picture, indexes=[index], views=views))
 
 
@@ -297,7 +297,7 @@ def test_the_file_stays_small_whatever_is_shown(porto: Reference, found: Locatio
 
 
 def test_limits_can_be_chosen(porto: Reference, drone: RoadMask, found: Location) -> None:
-    options = ViewOptions(
+    options = ViewLimits(
         max_map_vertices=200, max_query_vertices=100, max_matches=3, picture_bytes=2000, overview_bytes=2000
     )
     page = render_report(found, drone, porto.index, options=options)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from roadgeo.qgis.plugin.refit import Match, fit, format_points, place, read_points, rms
+from roadgeo.qgis.plugin.refit import TiePoint, fit, format_points, place, read_points, rms
 
 TRUTH = np.array([[1.1, 0.2, 330_000.0], [0.15, -1.05, 4_690_000.0], [2e-5, -1e-5, 1.0]])
 TRUTH[:2] += np.outer([330_000.0, 4_690_000.0], TRUTH[2] - (0.0, 0.0, 1.0))
@@ -14,7 +14,7 @@ def matches(n=12, noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     pixels = rng.uniform(0, 800, (n, 2))
     ground = place(TRUTH, pixels) + rng.normal(0.0, noise, (n, 2)) if noise else place(TRUTH, pixels)
-    return [Match(*pixel, *there) for pixel, there in zip(pixels.tolist(), ground.tolist(), strict=True)]
+    return [TiePoint(*pixel, *there) for pixel, there in zip(pixels.tolist(), ground.tolist(), strict=True)]
 
 
 @pytest.mark.parametrize("n", [4, 5, 30])
@@ -40,10 +40,10 @@ def test_it_is_the_least_squares_that_opencv_finds():
 def test_a_wrong_match_is_told_and_can_be_switched_off_or_dragged_back():
     given = matches(12)
     right = given[5]
-    given[5] = Match(right.column, right.row, right.x + 80.0, right.y)
+    given[5] = TiePoint(right.column, right.row, right.x + 80.0, right.y)
     worst = fit(given)
     assert int(np.argmax(worst.residuals)) == 5
-    given[5] = Match(right.column, right.row, right.x + 80.0, right.y, on=False)
+    given[5] = TiePoint(right.column, right.row, right.x + 80.0, right.y, on=False)
     found = fit(given)
     assert found.residuals[5] == pytest.approx(80.0, abs=1e-2)  # told of what is off, too
     assert max(apart for k, apart in enumerate(found.residuals) if k != 5) < 1e-3
@@ -56,8 +56,8 @@ def test_a_wrong_match_is_told_and_can_be_switched_off_or_dragged_back():
     [
         [],
         matches(3),
-        [Match(100.0 * k, 50.0 * k, 100.0 * k, 50.0 * k) for k in range(8)],
-        [Match(match.column, match.row, match.x, match.y, k < 3) for k, match in enumerate(matches(9))],
+        [TiePoint(100.0 * k, 50.0 * k, 100.0 * k, 50.0 * k) for k in range(8)],
+        [TiePoint(match.column, match.row, match.x, match.y, k < 3) for k, match in enumerate(matches(9))],
     ],
 )
 def test_too_little_is_no_fit(given):
@@ -68,7 +68,7 @@ def test_too_little_is_no_fit(given):
 
 
 def test_what_is_written_is_read_and_what_is_no_such_file_is_told(tmp_path):
-    given = [*matches(6), Match(1.0, 2.0, 3.0, 4.0, on=False)]
+    given = [*matches(6), TiePoint(1.0, 2.0, 3.0, 4.0, on=False)]
     path = tmp_path / "matches.points"
     path.write_text(format_points("LOCAL_CS[...]", given, fit(given)), "utf-8")
     assert read_points(path) == ("LOCAL_CS[...]", given)

@@ -12,7 +12,7 @@ from support.real_qgis import Qgis
 from worlds.demo import DRONE, MASKS
 
 from roadgeo.evaluation.demo import ROADS
-from roadgeo.qgis.plugin.refit import Match, fit, read_points
+from roadgeo.qgis.plugin.refit import TiePoint, fit, read_points
 
 FOOTPRINT, ROAD = "#1f6fb4", "#e4572e"
 
@@ -145,7 +145,7 @@ def test_the_panel_opens_with_the_points_of_what_was_located(seen: dict) -> None
     assert dock["shown"]
     assert seen["opened"] == [dock["picture"], dock["matches"]]  # from the menu as well
     assert dock["head"] == "Residual (m)"
-    given = [Match(*point) for point in dock["points"]]
+    given = [TiePoint(*point) for point in dock["points"]]
     assert dock["said"].startswith(f"{len(given)} of {len(given)} points")
     assert dock["said"].endswith(" m root mean square")
     assert np.allclose(dock["before"], fit(given).residuals, rtol=2e-3, atol=0.006)  # on the ellipsoid, not the plane

@@ -34,7 +34,7 @@ from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.running.passes import Sighting
 from roadgeo.running.pool import Died
-from roadgeo.serving.workers import ImageRequest, Serving, Workers, _reply
+from roadgeo.serving.workers import ImageRequest, ImageWorkers, Serving, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 #: The program that serves.
@@ -49,7 +49,7 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         "noise.jpg": (b"\xff\xd8\xff\xe0" + bytes(range(256)), 422),
         "empty.tif": (b"II*\0", 422),
     }
-    workers = Workers([str(folder / "town.gpkg")], 1, 2)
+    workers = ImageWorkers([str(folder / "town.gpkg")], 1, 2)
     try:
         for name, (content, status) in hostile.items():
             (tmp_path / name).write_bytes(content)
@@ -116,7 +116,7 @@ def test_a_port_that_is_taken_is_said(place, capsys):
 
 @pytest.fixture
 def one_worker(place):
-    workers = Workers([str(place[0] / "town.gpkg")], 1, 2)
+    workers = ImageWorkers([str(place[0] / "town.gpkg")], 1, 2)
     yield workers, ImageRequest(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000)
     workers.close()
 
@@ -228,7 +228,7 @@ def test_a_place_is_told_though_there_is_no_room_for_its_view(place, monkeypatch
 
 def test_a_missing_reference_is_said(tmp_path):
     with pytest.raises(IndexFormatError):
-        Workers([str(tmp_path / "nonesuch.gpkg")], 1, 0)
+        ImageWorkers([str(tmp_path / "nonesuch.gpkg")], 1, 0)
 
 
 def test_the_command_serves_until_it_is_interrupted(place):

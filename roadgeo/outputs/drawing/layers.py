@@ -11,8 +11,21 @@ from dataclasses import dataclass, field
 from roadgeo._arrays import AnyArray, FloatArray
 
 __all__ = [
-    "LOOKS", "PALETTE", "Arrows", "Box", "Circles", "Color", "Cross", "Dots", "Layer", "Lines", "Look", "Mark",
-    "Picture", "Ring", "rgb",
+    "PALETTE",
+    "STYLES",
+    "Arrows",
+    "Bitmap",
+    "Box",
+    "Circles",
+    "Color",
+    "Cross",
+    "Dots",
+    "Layer",
+    "Lines",
+    "Mark",
+    "Ring",
+    "Style",
+    "rgb",
 ]  # fmt: skip
 
 Color = tuple[int, int, int]
@@ -49,7 +62,7 @@ def rgb(color: str) -> Color:
 
 
 @dataclass(frozen=True)
-class Look:
+class Style:
     """How a layer looks.
 
     Attributes
@@ -73,28 +86,28 @@ class Look:
     dash: str = ""
 
 
-#: Looks by the names of layers.
-LOOKS = {
-    "ground": Look("halo", 0.0, fill=1.0),
-    "map-roads": Look("map-road", 4.0, width_m=9.0),
-    "query-roads": Look("query", 1.7),
-    "agreeing-roads": Look("agree", 1.7),
-    "branches": Look("arrow", 1.2),
-    "footprint": Look("frame", 3.0),
-    "edge": Look("frame", 2.0),
-    "matches": Look("match", 7.0),
-    "unmatched": Look("faint", 5.0),
-    "residuals": Look("arrow", 1.6),
-    "sigma": Look("frame", 1.6, dash="4 4"),
-    "runner-up": Look("other", 3.0),
-    "now": Look("ink", 3.0, fill=0.22),
-    "streets": Look("ink", 0.8),
-    "way": Look("ink", 1.6, dash="5 3"),
-    **{name: Look("good", 2.0, fill=0.15) for name in ("located", "right")},
-    **{name: Look("fair", 2.0, fill=0.15) for name in ("ambiguous", "chosen", "predicted")},
-    **{name: Look("bad", 2.0, fill=0.15) for name in ("wrong", "lost")},
-    "tracked": Look("frame", 2.0, fill=0.15),
-    "not_located": Look("faint", 2.0, fill=0.15),
+#: Styles by the names of layers.
+STYLES = {
+    "ground": Style("halo", 0.0, fill=1.0),
+    "map-roads": Style("map-road", 4.0, width_m=9.0),
+    "query-roads": Style("query", 1.7),
+    "agreeing-roads": Style("agree", 1.7),
+    "branches": Style("arrow", 1.2),
+    "footprint": Style("frame", 3.0),
+    "edge": Style("frame", 2.0),
+    "matches": Style("match", 7.0),
+    "unmatched": Style("faint", 5.0),
+    "residuals": Style("arrow", 1.6),
+    "sigma": Style("frame", 1.6, dash="4 4"),
+    "runner-up": Style("other", 3.0),
+    "now": Style("ink", 3.0, fill=0.22),
+    "streets": Style("ink", 0.8),
+    "way": Style("ink", 1.6, dash="5 3"),
+    **{name: Style("good", 2.0, fill=0.15) for name in ("located", "right")},
+    **{name: Style("fair", 2.0, fill=0.15) for name in ("ambiguous", "chosen", "predicted")},
+    **{name: Style("bad", 2.0, fill=0.15) for name in ("wrong", "lost")},
+    "tracked": Style("frame", 2.0, fill=0.15),
+    "not_located": Style("faint", 2.0, fill=0.15),
 }
 
 
@@ -128,7 +141,7 @@ class Ring:
 
 
 @dataclass(frozen=True)
-class Picture:
+class Bitmap:
     """A picture (h, w, 4) uint8, red, green, blue, alpha, stretched to a box.
 
     On a page it takes at most `max_bytes`; a drawing is coded `lossless`.
@@ -165,7 +178,7 @@ class Cross:
     text: str
 
 
-Mark = Lines | Dots | Ring | Picture | Arrows | Circles | Cross
+Mark = Lines | Dots | Ring | Bitmap | Arrows | Circles | Cross
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
-from roadgeo.outputs.drawing.layers import LOOKS, Box, Color, Dots, Layer, Lines, Look, Picture, Ring, rgb
+from roadgeo.outputs.drawing.layers import STYLES, Bitmap, Box, Color, Dots, Layer, Lines, Ring, Style, rgb
 
 __all__ = [
     "FAINT", "INK", "LIT", "SHIFT", "Canvas", "below", "beside", "blank", "draw_legend", "draw_plate", "draw_scale_bar",
@@ -65,42 +65,42 @@ class Canvas:
             if not layer.shown:
                 continue
             for mark in layer.marks:
-                self._draw_mark(mark, LOOKS.get(layer.name))
+                self._draw_mark(mark, STYLES.get(layer.name))
 
-    def _draw_mark(self, mark: object, look: Look | None) -> None:
-        match mark, look:
-            case Picture(image, box, _, _), _:
+    def _draw_mark(self, mark: object, style: Style | None) -> None:
+        match mark, style:
+            case Bitmap(image, box, _, _), _:
                 self._blend(image, box)
-            case Lines(lines), Look():
+            case Lines(lines), Style():
                 drawn = [self.pixels(line) for line in lines]
-                cv2.polylines(self.image, drawn, False, rgb(look.color), self._width(look), cv2.LINE_AA, SHIFT)
-            case Dots(points, hollow), Look():
-                self._draw_dots(self.pixels(points), look, hollow)
-            case Ring(corners, up), Look():
-                self._draw_ring(self.pixels(corners), look, up)
+                cv2.polylines(self.image, drawn, False, rgb(style.color), self._width(style), cv2.LINE_AA, SHIFT)
+            case Dots(points, hollow), Style():
+                self._draw_dots(self.pixels(points), style, hollow)
+            case Ring(corners, up), Style():
+                self._draw_ring(self.pixels(corners), style, up)
 
-    def _width(self, look: Look) -> int:
-        if look.width_m:
-            return int(np.clip(round(look.width_m * self.scale), 2, 12))
-        return max(round(look.width_px * _WEIGHT), 1)
+    def _width(self, style: Style) -> int:
+        if style.width_m:
+            return int(np.clip(round(style.width_m * self.scale), 2, 12))
+        return max(round(style.width_px * _WEIGHT), 1)
 
-    def _draw_dots(self, centers: AnyArray, look: Look, hollow: bool) -> None:
+    def _draw_dots(self, centers: AnyArray, style: Style, hollow: bool) -> None:
         crowd = 1.0 if len(centers) < 200 else 0.7 if len(centers) < 1000 else 0.3
-        radius = look.width_px * _WEIGHT * crowd / 2
-        outer, inner = (look.color, "paper") if hollow else ("halo", look.color)
+        radius = style.width_px * _WEIGHT * crowd / 2
+        outer, inner = (style.color, "paper") if hollow else ("halo", style.color)
         radii = (radius, radius / 2) if hollow else (radius + 1.6, radius)
         for x, y in centers.reshape(-1, 2).tolist():
             for color, size in zip((outer, inner), radii, strict=True):
                 cv2.circle(self.image, (x, y), round(size * (1 << SHIFT)), rgb(color), -1, cv2.LINE_AA, SHIFT)
 
-    def _draw_ring(self, ring: AnyArray, look: Look, up: bool) -> None:
-        color = rgb(look.color)
-        if look.fill:
-            filled = self.image if look.fill == 1.0 else self.image.copy()
+    def _draw_ring(self, ring: AnyArray, style: Style, up: bool) -> None:
+        color = rgb(style.color)
+        if style.fill:
+            filled = self.image if style.fill == 1.0 else self.image.copy()
             cv2.fillPoly(filled, [ring], color, cv2.LINE_AA, SHIFT)
-            self.image[...] = cv2.addWeighted(filled, look.fill, self.image, 1.0 - look.fill, 0.0)
-        if look.width_px:
-            width = self._width(look)
+            self.image[...] = cv2.addWeighted(filled, style.fill, self.image, 1.0 - style.fill, 0.0)
+        if style.width_px:
+            width = self._width(style)
             cv2.polylines(self.image, [ring], True, LIT, width + 3, cv2.LINE_AA, SHIFT)
             cv2.polylines(self.image, [ring], True, color, width, cv2.LINE_AA, SHIFT)
         if up:
@@ -178,16 +178,16 @@ def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int,
     """Write the labels of the layers that are shown, each with its sign, from (x, baseline) on."""
     middle = baseline - round(size * 0.35)
     for layer in layers:
-        look = LOOKS.get(layer.name)
-        if look is None or not (layer.shown and layer.label and layer.marks):
+        style = STYLES.get(layer.name)
+        if style is None or not (layer.shown and layer.label and layer.marks):
             continue
         if isinstance(layer.marks[0], Dots):
-            cv2.circle(image, (x + size // 2, middle), 6, rgb(look.color), -1, cv2.LINE_AA)
+            cv2.circle(image, (x + size // 2, middle), 6, rgb(style.color), -1, cv2.LINE_AA)
             end = x + round(1.3 * size)
         else:
-            width = 6 if look.width_m else max(round(look.width_px * _WEIGHT), 3)
+            width = 6 if style.width_m else max(round(style.width_px * _WEIGHT), 3)
             end = x + round(2.5 * size)
-            cv2.line(image, (x + 4, middle), (end - size // 2, middle), rgb(look.color), width, cv2.LINE_AA)
+            cv2.line(image, (x + 4, middle), (end - size // 2, middle), rgb(style.color), width, cv2.LINE_AA)
         x = write_text(image, layer.label, (end, baseline), size, INK) + round(1.4 * size)
 
 

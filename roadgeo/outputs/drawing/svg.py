@@ -13,19 +13,19 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo._text import in_html
 from roadgeo.outputs.drawing.layers import (
-    LOOKS,
     PALETTE,
+    STYLES,
     Arrows,
+    Bitmap,
     Box,
     Circles,
     Cross,
     Dots,
     Layer,
     Lines,
-    Look,
     Mark,
-    Picture,
     Ring,
+    Style,
 )
 from roadgeo.outputs.drawing.raster import encode
 
@@ -45,13 +45,13 @@ _QUALITY, _LOSSLESS = 78, 101
 
 
 def stylesheet() -> str:
-    """Return the colours, light and dark, and the look of every layer, as CSS."""
+    """Return the colours, light and dark, and the style of every layer, as CSS."""
     light, dark = ("".join(f" --{name}: {colors[screen]};" for name, colors in PALETTE.items()) for screen in (0, 1))
     rules = [
         f":root {{ color-scheme: light dark;{light} }}",
         f"@media (prefers-color-scheme: dark) {{ :root {{{dark} }} }}",
         "svg * { vector-effect: non-scaling-stroke; fill: none; stroke-linejoin: round; stroke-linecap: round; }",
-        *(_rule(name, look) for name, look in LOOKS.items()),
+        *(_rule(name, style) for name, style in STYLES.items()),
         ".matches path.halo { stroke: var(--halo); stroke-width: 10px; }",
         ".unmatched path.core { stroke: var(--paper); stroke-width: 2.4px; }",
         ".footprint path.up, .edge path.up { fill: var(--frame); stroke: none; }",
@@ -62,16 +62,16 @@ def stylesheet() -> str:
     return "\n".join(rules) + "\n"
 
 
-def _rule(name: str, look: Look) -> str:
-    """Write the look of a layer: of its group in a view, and of its sign in a legend."""
-    width = f"{look.width_px:g}px"
-    if look.width_m:
-        width = f"clamp(2px, calc({look.width_m:g}px / var(--u, 3)), 14px)"
-    parts = [f"stroke: var(--{look.color})" if look.width_px else "stroke: none", f"stroke-width: {width}"]
-    if look.fill:
-        parts += [f"fill: var(--{look.color})", f"fill-opacity: {look.fill:g}"]
-    if look.dash:
-        parts.append(f"stroke-dasharray: {look.dash}")
+def _rule(name: str, style: Style) -> str:
+    """Write the style of a layer: of its group in a view, and of its sign in a legend."""
+    width = f"{style.width_px:g}px"
+    if style.width_m:
+        width = f"clamp(2px, calc({style.width_m:g}px / var(--u, 3)), 14px)"
+    parts = [f"stroke: var(--{style.color})" if style.width_px else "stroke: none", f"stroke-width: {width}"]
+    if style.fill:
+        parts += [f"fill: var(--{style.color})", f"fill-opacity: {style.fill:g}"]
+    if style.dash:
+        parts.append(f"stroke-dasharray: {style.dash}")
     where = ", ".join(f"{group}{name} {shape}" for group in ("svg .", "svg.") for shape in ("path", "circle"))
     return f"{where} {{ {'; '.join(parts)}; }}"
 
@@ -97,7 +97,7 @@ def _draw_mark(mark: Mark) -> str:
             return draw_dots(points, ("", "core") if hollow else ("halo", ""))
         case Ring():
             return _draw_ring(mark)
-        case Picture(image, box, max_bytes, lossless):
+        case Bitmap(image, box, max_bytes, lossless):
             return draw_image(image, box, max_bytes, lossless=lossless)
         case Arrows(at, steps):
             return _draw_arrows(at, steps)
@@ -115,7 +115,7 @@ def draw_sign(layer: Layer) -> str:
         case Dots(_, hollow):
             first, second = ("", ' class="core"') if hollow else (' class="halo"', "")
             return f'<path{first} d="M13 7h.1"/><path{second} d="M13 7h.1"/>'
-        case Picture():
+        case Bitmap():
             return '<rect x="3" y="2" width="20" height="10"/>'
         case Ring():
             return '<path d="M3 2h20v10h-20z"/>'

@@ -13,6 +13,7 @@ from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.layers import (
     Arrows,
+    Bitmap,
     Box,
     Circles,
     Color,
@@ -20,7 +21,6 @@ from roadgeo.outputs.drawing.layers import (
     Dots,
     Layer,
     Lines,
-    Picture,
     Ring,
     rgb,
 )
@@ -122,7 +122,7 @@ def mask_picture(mask: RoadMask, color: Color, side: int) -> AnyArray:
 
 def mask_layer(subject: Subject) -> Layer:
     """Return the mask alone, whatever photograph it was made of."""
-    return Layer("picture", "", [Picture(mask_picture(subject.mask, _GREY, subject.views.picture_px), subject.box)])
+    return Layer("picture", "", [Bitmap(mask_picture(subject.mask, _GREY, subject.views.picture_px), subject.box)])
 
 
 def _tinted(opacity: AnyArray, color: Color, side: int) -> AnyArray:
@@ -159,7 +159,7 @@ def frame_layers(subject: Subject) -> list[Layer]:
 def _picture_layer(subject: Subject, image: AnyArray, box: Box) -> Layer:
     """Return the photograph, or the mask, inside a box."""
     is_photograph = subject.photo is not None
-    picture = Picture(image, box, subject.views.picture_bytes, lossless=not is_photograph)
+    picture = Bitmap(image, box, subject.views.picture_bytes, lossless=not is_photograph)
     return Layer("picture", "photograph" if is_photograph else "mask", [picture])
 
 
@@ -169,7 +169,7 @@ def probability_layer(subject: Subject) -> list[Layer]:
     if values is None:
         return []
     image = _tinted(np.where(values == _UNKNOWN, 0, values).astype(np.uint8), _PROBABLE, views.picture_px)
-    picture = Picture(image, subject.box, views.picture_bytes, lossless=True)
+    picture = Bitmap(image, subject.box, views.picture_bytes, lossless=True)
     return [Layer("probability", "probability of road", [picture], shown=False)]
 
 
@@ -239,4 +239,4 @@ def whole_map(index: ReferenceIndex, max_bytes: int, width_px: int) -> tuple[Lay
     ends = (index.segments.reshape(-1, 2, 2) - (x0, y0 + rows * size)) * (scale, -scale)
     cv2.polylines(alpha, list(np.rint(ends * 16).astype(np.int32)), False, 160, 1, cv2.LINE_AA, 4)
     image = _tinted(alpha, _GREY, max(alpha.shape))
-    return Layer("picture", "", [Picture(image, window.box, max_bytes, lossless=True)]), window
+    return Layer("picture", "", [Bitmap(image, window.box, max_bytes, lossless=True)]), window

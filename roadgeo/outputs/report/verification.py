@@ -14,7 +14,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.outputs.drawing.layers import Layer, Lines, Picture
+from roadgeo.outputs.drawing.layers import Bitmap, Layer, Lines
 from roadgeo.outputs.drawing.svg import join_segments, thin_lines
 from roadgeo.outputs.drawing.views import touching
 from roadgeo.outputs.names import bare_name
@@ -78,7 +78,7 @@ def _draw(
     """Draw the image, and the map's roads in its pixels."""
     width, height = place.size
     box = (0.0, 0.0, float(width), float(height))
-    layers = [Layer("picture", "image", [Picture(read_preview(Path(image), _PICTURE_PX), box, _PICTURE_BYTES)])]
+    layers = [Layer("picture", "image", [Bitmap(read_preview(Path(image), _PICTURE_PX), box, _PICTURE_BYTES)])]
     if index is not None:
         given = "the map's roads, as the image has them" if corrected else "roads of the map"
         layers.append(Layer("map-roads" if corrected else "query-roads", given, _roads_in(place, index)))

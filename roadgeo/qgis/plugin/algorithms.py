@@ -27,7 +27,7 @@ from .environment import ask_version, install
 from .library import list_places, list_references
 from .parameters import Option, Values
 from .runner import find_program
-from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Group, Session
+from .session import PICTURE_KEPT, POINTS_KEPT, Finding, LayerGroup, Session
 from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
 
 __all__ = ["ALGORITHMS"]
@@ -248,7 +248,7 @@ class VectorizeMask(RoadgeoAlgorithm):
         mask, folder = values.raster("MASK"), values.path("String", "OUTPUT_FOLDER")
         session.call("vectorize", mask, f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(mask).stem}_vectorized.gpkg"
-        group = Group(Path(mask).stem)
+        group = LayerGroup(Path(mask).stem)
         roads = session.show(path, "Roads as seen", "roads", group)
         session.show(path, "Intersections as seen", "intersections", group)
         return {"OUTPUT_FOLDER": folder, "VECTORIZED": roads}
@@ -299,7 +299,7 @@ def _locate(mask: str, picture: str, options: list[str], values: Values, session
 def _show_location(location: dict[str, Any], stem: Path, kept: dict[str, str], session: Session) -> dict[str, Any]:
     """Return the outputs of a location, and load its layers."""
     name, package = stem.name, stem.with_name(f"{stem.name}_location.gpkg")
-    group = Group(name)
+    group = LayerGroup(name)
     for title, layer in (("matches", "matches"), (_RESIDUALS, "residuals"), ("roads", "query_roads")):
         session.show(package, f"{name} {title}", layer, group)
     return {

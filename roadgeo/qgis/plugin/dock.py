@@ -42,7 +42,7 @@ from qgis.PyQt.QtWidgets import (
 from qgis.utils import iface
 
 from .canvases import Side
-from .refit import FEWEST, Fit, Match, corners, fit, format_points, place, read_points, rms
+from .refit import FEWEST, Fit, TiePoint, corners, fit, format_points, place, read_points, rms
 from .session import PICTURE_KEPT, POINTS_KEPT
 from .window import open_dialog, show_points
 
@@ -68,7 +68,7 @@ class MatchDock(QDockWidget):
 
     Attributes
     ----------
-    matches : list of Match
+    matches : list of TiePoint
         The current ones; `found` is the fit through them.
     apart : list of float
         Distance of each, on or off, from where the fit puts it: metres where the CRS is known, else map units.
@@ -81,12 +81,12 @@ class MatchDock(QDockWidget):
     def __init__(self, parent: Any = None) -> None:
         super().__init__("roadgeo: mend a place by hand", parent)
         self.setObjectName("RoadgeoMatches")
-        self.matches: list[Match] = []
+        self.matches: list[TiePoint] = []
         self.fitted = Fit(None)
         self.apart: list[float] = []
         self.rows: list[_Row] = []
         self.crs, self.picture, self.size = "", "", (0, 0)
-        self._past: list[list[Match]] = []
+        self._past: list[list[TiePoint]] = []
         self._clicked: dict[str, tuple[float, float]] = {}
         self._filling = False
         self.view, self.canvas = Side("picture", self), Side("map", self)
@@ -208,7 +208,7 @@ class MatchDock(QDockWidget):
         self._zoom()
         return True
 
-    def _renew(self, matches: list[Match]) -> None:
+    def _renew(self, matches: list[TiePoint]) -> None:
         """Take other points."""
         self.matches, self._clicked = list(matches), {}
         for side in (self.view, self.canvas):
@@ -259,7 +259,7 @@ class MatchDock(QDockWidget):
             self._clicked[other] = tuple(place(matrix, np.array([[u, v]]))[0].tolist())
         if len(self._clicked) == 2:
             self.remember()
-            self._renew([*self.matches, Match(*self._clicked["picture"], *self._clicked["map"])])
+            self._renew([*self.matches, TiePoint(*self._clicked["picture"], *self._clicked["map"])])
             self.list.setCurrentItem(self.rows[-1])
         else:
             self.status.setText(f"Now click the same spot on the {other}.")

@@ -11,7 +11,7 @@ from qgis.PyQt.QtGui import QDesktopServices
 from qgis.utils import plugins
 
 from .places import PlacesDialog
-from .refit import Match, corners, fit, format_points
+from .refit import TiePoint, corners, fit, format_points
 from .session import Finding
 from .window import keep, open_dialog, push, zoom
 
@@ -66,6 +66,6 @@ def _mend(finding: Finding) -> None:
     if not points:
         points = QgsProcessingUtils.generateTempFilename(f"{finding.name}.points")
         pixels = corners(*location["size"]).tolist()
-        matches = [Match(*pixel, *there) for pixel, there in zip(pixels, location["footprint"])]  # noqa: B905
+        matches = [TiePoint(*pixel, *there) for pixel, there in zip(pixels, location["footprint"])]  # noqa: B905
         Path(points).write_text(format_points(location["crs"], matches, fit(matches)), "utf-8")
     _menu().mend(finding.picture, points)

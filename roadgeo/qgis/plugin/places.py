@@ -18,7 +18,7 @@ from qgis.PyQt.QtWidgets import (
 )
 from qgis.utils import iface
 
-from .library import LONLAT, Place, list_places
+from .library import LONLAT, ListedPlace, list_places
 from .session import Finding
 from .window import open_dialog, to_map, zoom
 
@@ -32,7 +32,7 @@ class PlacesDialog(QDialog):
 
     Attributes
     ----------
-    places : list of Place
+    places : list of ListedPlace
     """
 
     def __init__(self, algorithm: str, finding: Finding) -> None:
@@ -104,7 +104,7 @@ class PlacesDialog(QDialog):
             iface.mapCanvas().scene().removeItem(marker)
 
 
-def _mark(place: Place) -> Any:
+def _mark(place: ListedPlace) -> Any:
     marker = QgsVertexMarker(iface.mapCanvas())
     marker.setCenter(to_map(place.lon, place.lat))
     marker.setIconType(QgsVertexMarker.IconType.ICON_CIRCLE)
@@ -113,14 +113,14 @@ def _mark(place: Place) -> Any:
     return marker
 
 
-def _measure(place: Place, other: Place) -> float:
+def _measure(place: ListedPlace, other: ListedPlace) -> float:
     """Return the distance of two places, metres."""
     measure = QgsDistanceArea()
     measure.setEllipsoid("WGS84")
     return float(measure.measureLine(QgsPointXY(place.lon, place.lat), QgsPointXY(other.lon, other.lat)))
 
 
-def _compare(best: Place, place: Place) -> str:
+def _compare(best: ListedPlace, place: ListedPlace) -> str:
     """Return how likely a place is beside the best, rounded as a person would."""
     if place is best:
         return "best"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["FEWEST", "Fit", "Match", "corners", "fit", "format_points", "place", "read_points", "rms"]
+__all__ = ["FEWEST", "Fit", "TiePoint", "corners", "fit", "format_points", "place", "read_points", "rms"]
 
 #: Points that a homography needs.
 FEWEST = 4
@@ -22,7 +22,7 @@ _COLUMNS = "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
 
 
 @dataclass(frozen=True)
-class Match:
+class TiePoint:
     """A point of the picture, pixels from its top left corner, and the same on the map, in its CRS."""
 
     column: float
@@ -53,7 +53,7 @@ def rms(residuals: Sequence[float]) -> float:
     return math.sqrt(sum(apart * apart for apart in residuals) / len(residuals))
 
 
-def read_points(path: str | Path) -> tuple[str, list[Match]]:
+def read_points(path: str | Path) -> tuple[str, list[TiePoint]]:
     """Read a control-point file: the map's CRS as WKT ("" where it is missing), and the matches.
 
     Raises
@@ -69,7 +69,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
     try:
         rows = list(csv.DictReader(line for line in lines if line and not line.startswith("#")))
         matches = [
-            Match(float(r["sourceX"]), -float(r["sourceY"]), float(r["mapX"]), float(r["mapY"]), r["enable"] != "0")
+            TiePoint(float(r["sourceX"]), -float(r["sourceY"]), float(r["mapX"]), float(r["mapY"]), r["enable"] != "0")
             for r in rows
         ]
     except (KeyError, TypeError, ValueError, csv.Error) as error:
@@ -79,7 +79,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
     return crs, matches
 
 
-def format_points(crs: str, matches: Sequence[Match], fitted: Fit) -> str:
+def format_points(crs: str, matches: Sequence[TiePoint], fitted: Fit) -> str:
     """Return the text that `read_points` and the Georeferencer read."""
     lines = [*([f"#CRS: {crs}"] if crs else []), _COLUMNS]
     for match, apart in zip(matches, np.nan_to_num(fitted.residuals).tolist()):  # noqa: B905 (as long as each other)
@@ -87,7 +87,7 @@ def format_points(crs: str, matches: Sequence[Match], fitted: Fit) -> str:
     return "\n".join(lines) + "\n"
 
 
-def fit(matches: Sequence[Match]) -> Fit:
+def fit(matches: Sequence[TiePoint]) -> Fit:
     """Fit a homography to the matches that are on: least squares of the distances on the map (Gauss-Newton).
 
     Four are met exactly. It starts from the linear solution in normalised coordinates (Hartley & Zisserman, 4.1, 4.4).

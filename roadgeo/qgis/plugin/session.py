@@ -25,7 +25,7 @@ from .library import find_reference, parse
 from .runner import in_words_of_qgis, run
 from .settings import NOT_FOUND, locate_command
 
-__all__ = ["PICTURE_KEPT", "POINTS_KEPT", "Finding", "Group", "Session"]
+__all__ = ["PICTURE_KEPT", "POINTS_KEPT", "Finding", "LayerGroup", "Session"]
 
 #: Properties of the layer that shows a footprint: the picture, and its matched intersections, to mend it by hand.
 PICTURE_KEPT, POINTS_KEPT = "roadgeo/picture", "roadgeo/points"
@@ -56,7 +56,7 @@ class Finding:
     parameters: dict[str, Any]
 
 
-class Group:
+class LayerGroup:
     """A group of results on top of the project's layers: made with its first layer, under a name that no other has."""
 
     def __init__(self, name: str) -> None:
@@ -77,7 +77,7 @@ class _Styler(QgsProcessingLayerPostProcessorInterface):
     custom properties of the layer, which the project keeps.
     """
 
-    def __init__(self, group: Group | str | None, kept: Mapping[str, str]) -> None:
+    def __init__(self, group: LayerGroup | str | None, kept: Mapping[str, str]) -> None:
         super().__init__()
         self.group, self.kept = group, dict(kept)
 
@@ -90,7 +90,7 @@ class _Styler(QgsProcessingLayerPostProcessorInterface):
         node = root.findLayer(layer.id())
         if self.group == "" or node is None:
             return
-        into, place = (self.group.node(root), 0) if isinstance(self.group, Group) else (root, -1)
+        into, place = (self.group.node(root), 0) if isinstance(self.group, LayerGroup) else (root, -1)
         into.insertChildNode(place, node.clone())
         node.parent().removeChildNode(node)
 
@@ -169,7 +169,7 @@ class Session:
         path: Path,
         title: str,
         layer: str = "",
-        group: Group | str | None = "",
+        group: LayerGroup | str | None = "",
         kept: Mapping[str, str] | None = None,
     ) -> str:
         """Have a result loaded when all is done (see `_Styler`); return the name by which QGIS opens it."""

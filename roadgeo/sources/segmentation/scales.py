@@ -73,7 +73,7 @@ def rank_scales(
         return {scales[0]: None}
     maps: dict[float, ProbabilityMap | None] = {}
     ranking: dict[float, float] = {}
-    part, before, promise = _Part(0, 0, photograph.width, photograph.height), None, 1.0
+    part, before, promise = _Crop(0, 0, photograph.width, photograph.height), None, 1.0
     most, most_intersections, hopeless = 0.0, 0.0, False
     for scale in scales:
         if hopeless:
@@ -117,7 +117,7 @@ def score(probability: ProbabilityMap | None) -> float:
     return float(np.count_nonzero(degrees >= 3)) * sure**_CERTAINTY_POWER
 
 
-class _Part(NamedTuple):
+class _Crop(NamedTuple):
     """A part of a photograph, pixels."""
 
     left: int
@@ -127,13 +127,13 @@ class _Part(NamedTuple):
 
 
 def _most_roads(
-    part: _Part, probability: ProbabilityMap | None, size: Sequence[int]
-) -> tuple[_Part, ProbabilityMap | None]:
+    part: _Crop, probability: ProbabilityMap | None, size: Sequence[int]
+) -> tuple[_Crop, ProbabilityMap | None]:
     """Return the (height, width) at most of a part where most roads were seen, and the probability there."""
     height, width = (min(side, most) for side, most in zip((part.height, part.width), size, strict=True))
     if probability is None or (height, width) == (part.height, part.width):
         left, top = part.left + (part.width - width) // 2, part.top + (part.height - height) // 2
-        return _Part(left, top, width, height), probability
+        return _Crop(left, top, width, height), probability
     rows, columns = probability.values.shape
     y_scale, x_scale = rows / part.height, columns / part.width
     h, w = max(1, round(height * y_scale)), max(1, round(width * x_scale))
@@ -144,4 +144,4 @@ def _most_roads(
     left = part.left + min(round(float(x) / x_scale), part.width - width)
     top = part.top + min(round(float(y) / y_scale), part.height - height)
     values = np.ascontiguousarray(probability.values[y : y + h, x : x + w])
-    return _Part(left, top, width, height), replace(probability, values=values)
+    return _Crop(left, top, width, height), replace(probability, values=values)

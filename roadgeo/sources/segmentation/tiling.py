@@ -111,7 +111,7 @@ def _segment_part(
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
     done, rest = 0, np.empty((0, shape[1]), np.float32)
-    for rows in _blend(read, shape, _tiles_of(network, shape), partial(_look, network, ways)):
+    for rows in _blend(read, shape, _tiling_of(network, shape), partial(_look, network, ways)):
         rows = np.concatenate([rest, rows])
         n = len(rows) // step
         inside[done : done + n] = np.rint(PROBABILITY_SURE * _reduce(rows[: n * step], step))
@@ -136,7 +136,7 @@ def _reduce(rows: Float32Array, step: int) -> Float32Array:
     return np.asarray(cv2.resize(rows, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-class _Tiles(NamedTuple):
+class _Tiling(NamedTuple):
     """The visible part of a tile: its (height, width), where it begins in the tile, the tile's size, the overlap."""
 
     size: tuple[int, int]
@@ -145,13 +145,13 @@ class _Tiles(NamedTuple):
     overlap: float
 
 
-def _tiles_of(network: Network, shape: tuple[int, int]) -> _Tiles:
+def _tiling_of(network: Network, shape: tuple[int, int]) -> _Tiling:
     """Return the tiles of a picture of (H, W) pixels: of free size, no more than else, and no larger than they need."""
     tile, overlap = network.card.tile, network.card.overlap
     if not network.any_size:
-        return _Tiles(network.seen, network.margin, tile, overlap)
+        return _Tiling(network.seen, network.margin, tile, overlap)
     height, width = (_least(length, side, overlap) for length, side in zip(shape, tile, strict=True))
-    return _Tiles((height, width), (0, 0), (height, width), overlap)
+    return _Tiling((height, width), (0, 0), (height, width), overlap)
 
 
 def _least(length: int, tile: int, overlap: float) -> int:
@@ -163,7 +163,7 @@ def _least(length: int, tile: int, overlap: float) -> int:
 def _blend(
     read: Callable[[int, int], AnyArray],
     shape: tuple[int, int],
-    tiles: _Tiles,
+    tiles: _Tiling,
     network: Callable[[AnyArray], Float32Array],
 ) -> Iterator[Float32Array]:
     """Yield the rows of a map from the top down, each when no further tile reaches it."""
