@@ -1,7 +1,7 @@
 """Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
 
 BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
-The bands of the odds are the same as in `error_rate` of a result. The table of worn masks counts the searches kept in
+The bands of the score are the same as in `error_rate` of a result. The table of worn masks counts the searches kept in
 `examples/trust/results`. `--check` writes nothing, and fails if a table would change.
 """
 
@@ -105,7 +105,7 @@ def put(page: str, name: str, lines: Iterator[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it the odds alone")
+    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it scores alone")
     parser.add_argument("--check", action="store_true")
     options = parser.parse_args(arguments)
     before = page = PAGE.read_text(encoding="utf-8")

@@ -69,10 +69,10 @@ def verdicts(evaluation: Evaluation) -> Iterator[str]:
     if broken:
         step = broken[0]
         wrong = f"{step.wrong.hits} of {step.wrong.of}"
-        yield f"Odds promise too much: {wrong} located at 10^{step.at_least:g} or more are wrong."
+        yield f"Scores promise too much: {wrong} located at {step.at_least:g} or more are wrong."
     elif surest is not None:
         located = evaluation.odds[0].wrong
-        yield f"Odds hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
+        yield f"Scores hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
     if evaluation.sigma.within_1.of:
         robust = f"robustly {evaluation.sigma.robust:.2f}"
         yield f"Corner errors are {evaluation.sigma.rms:.2f} times what is claimed ({robust})."
