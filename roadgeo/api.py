@@ -13,7 +13,7 @@ from roadgeo.errors import MaskError, name_package
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.matching.hints import apply_hints, read_hint
+from roadgeo.matching.hints import STATED, apply_hints, asked_of_camera, read_hint
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
 from roadgeo.reference.reference import BuildOptions, Reference
@@ -187,7 +187,8 @@ def locate(
     options : LocateOptions
         Everything that can be chosen. The following override it; texts are read as on the command line.
     near : (longitude, latitude, metres)
-        The middle lies within that distance of this place.
+        The middle lies within that distance of this place. "exif", here and for `gsd`, `heading` and `focal`: as the
+        camera states it in a file's EXIF and XMP, with the errors of such statements.
     within : str or (west, south, east, north)
         The middle lies in this country or state, or within these degrees.
     gsd : float or (float, float)
@@ -199,7 +200,7 @@ def locate(
     max_tilt : float
         Greatest angle of the camera from the vertical, degrees.
     focal : float or "exif"
-        Focal length in pixels of the image; or as in a file's EXIF.
+        Focal length in pixels of the image.
     effort : "quick" or "full"
         Whether the search ends early, or roads alone are searched too (the default).
     time_limit : float
@@ -264,12 +265,12 @@ def locate(
 def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
     """Put what is known where the search looks for it."""
     hints = dict(read_hint(name, value) for name, value in given.items() if value is not None)
-    if hints.get("focal_px") == "exif":
-        from roadgeo.sources.exif import focal_in_pixels
+    if asked := asked_of_camera(hints):
+        from roadgeo.sources.camera import read_stated
 
         if not isinstance(image, str | os.PathLike):
-            raise ValueError('focal="exif" is for files; give the focal length in pixels')
-        hints["focal_px"] = focal_in_pixels(os.fspath(image))
+            raise ValueError('"exif" is for files; give the value, or leave it out')
+        hints.update(read_stated(asked, os.fspath(image)))
     return apply_hints(options, hints)
 
 
@@ -426,7 +427,10 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
 
 
 def _hint(name: str, value: Any) -> Any:
-    return None if value is None else read_hint(name, value)[1]
+    hint = None if value is None else read_hint(name, value)[1]
+    if hint == STATED:
+        raise ValueError(f"{name}: {STATED!r} is for `locate`; give the value, or leave it out")
+    return hint
 
 
 def _open(reference: References) -> list[AnyReference]:

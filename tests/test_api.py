@@ -202,3 +202,20 @@ def test_the_roads_of_a_place_are_fetched(monkeypatch: pytest.MonkeyPatch) -> No
         ("Porto, Portugal", None),
         (None, (-8.7, 41.1, -8.6, 41.2)),
     ]
+
+
+def test_what_the_camera_states_is_a_hint(porto: roadgeo.Reference, tmp_path: Path) -> None:
+    from sources.test_camera import MAKERS, photograph
+
+    photo = Image.open(DRONE).convert("L")
+    view = photograph(tmp_path / "photo.jpg", MAKERS["DJI"])
+    with Image.open(view) as stated:
+        photo.save(tmp_path / "drone.jpg", exif=stated.getexif(), xmp=stated.info["xmp"], quality=95)
+    with pytest.raises(ValueError, match="is for files"):
+        roadgeo.locate(photo, porto, QUICK, near="exif")
+    found = roadgeo.locate(tmp_path / "drone.jpg", porto, QUICK, near="exif")
+    assert not found.located  # it says that it is elsewhere
+    assert found.options["near"][:2] == pytest.approx((-8.6283, 41.1625), abs=1e-4)
+    free = roadgeo.locate(tmp_path / "drone.jpg", porto, QUICK)
+    assert free.located
+    assert free.stated_offset_m == pytest.approx(2050, rel=0.2)

@@ -37,7 +37,7 @@ from roadgeo.cli.options import (
 )
 from roadgeo.cli.printing import complain, echo, is_set, paint, tell
 from roadgeo.cli.truths import read_truths
-from roadgeo.matching.hints import HINTS, read_taken
+from roadgeo.matching.hints import HINTS, asked_of_camera, read_taken
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -182,7 +182,8 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
     """Find where images lie on a map, and draw them there; for the help see above."""
     from roadgeo.cli.progress import count_up, show_steps
 
-    options = make_options(hinted(given), given["method"], paper=given["paper"], pair=given["pair"])
+    hints = hinted(given)
+    options = make_options(hints, given["method"], paper=given["paper"], pair=given["pair"], may_be_stated=True)
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
     tasks = find_tasks(masks, given, out_dir)
@@ -198,13 +199,13 @@ def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir:
         outputs,
         read_options(given, jobs),
         images=photos,
-        exif=given["focal_px"] == "exif",
+        exif=asked_of_camera(hints),
         dem=given["dem"],
         skip_existing=given["skip_existing"],
         taken=given["taken"],
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
-    opened = open_maps(references, given["near"])
+    opened = open_maps(references, options.near)
     outcomes: list[Outcome] = []
     is_single = len(tasks) == 1
     steps = show_steps() if is_single else nullcontext(say_nothing)

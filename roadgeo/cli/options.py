@@ -15,7 +15,17 @@ import click
 
 from roadgeo.cli.fencing import OWN_PROCESS, enter_fence
 from roadgeo.cli.printing import echo, keep_switch
-from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_place, read_range
+from roadgeo.matching.hints import (
+    HINTS,
+    STATED,
+    Hint,
+    apply_hints,
+    asked_of_camera,
+    read_box,
+    read_gsd,
+    read_place,
+    read_range,
+)
 from roadgeo.storage.memory import MEMORY
 
 if TYPE_CHECKING:
@@ -333,7 +343,7 @@ def _read_crs(text: str) -> str:
 #: Two numbers, least and greatest; a pixel size; a place and a radius; a box in degrees.
 RANGE, GSD, NEAR, BOX = (
     Read("range", read_range),
-    Read("gsd", HINTS["gsd"].read),
+    Read("gsd", read_gsd),
     Read("near", read_place),
     Read("box", read_box),
 )
@@ -448,20 +458,28 @@ def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_options(
-    hints: Mapping[str, Any], method: Any = "auto", *, paper: bool = False, pair: Sequence[str] = ()
+    hints: Mapping[str, Any],
+    method: Any = "auto",
+    *,
+    paper: bool = False,
+    pair: Sequence[str] = (),
+    may_be_stated: bool = False,
 ) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is.
 
     Raises
     ------
     click.UsageError
-        The paper's method knows no hints; only that method has its thresholds.
+        The paper's method knows no hints; only that method has its thresholds. What the camera states is for single
+        images.
     """
     from dataclasses import replace
 
     from roadgeo.matching.paper import PAPER, PairOptions, read_options
     from roadgeo.workflows import LocateOptions
 
+    if not may_be_stated:
+        refuse_stated(hints)
     if method == "pair":
         idle = [hint for hint in HINTS.values() if hint.group != SEARCH and hints.get(hint.goes_to, False) is not False]
         if idle:
@@ -473,6 +491,20 @@ def make_options(
     except ValueError as error:
         raise click.UsageError(f"--pair {error}.") from error
     return apply_hints(replace(LocateOptions(), method=method, pair=thresholds), hints)
+
+
+def refuse_stated(hints: Mapping[str, Any]) -> None:
+    """Refuse what the camera is to state, where there is not one image at a time.
+
+    Raises
+    ------
+    click.UsageError
+        There is such a hint.
+    """
+    stated = asked_of_camera(hints)
+    if stated:
+        option = next(hint.option for hint in HINTS.values() if hint.goes_to in stated)
+        raise click.UsageError(f"{option} {STATED} is for `locate`: give the value here, or leave it out.")
 
 
 def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None) -> list[Task]:

@@ -8,7 +8,7 @@ import click
 
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import Command, read_options, take
+from roadgeo.cli.options import Command, read_options, refuse_stated, take
 from roadgeo.cli.printing import complain, echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
@@ -42,6 +42,7 @@ def vectorize_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.errors import RoadgeoError, is_of_memory
 
+    refuse_stated({"gsd_m": gsd_m})
     make_folder(out_dir)
     compile_once()
     reading = read_options(given)

@@ -18,10 +18,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HINTS",
+    "STATED",
     "Hint",
     "Taken",
     "apply_hints",
+    "asked_of_camera",
     "read_box",
+    "read_gsd",
     "read_hint",
     "read_numbers",
     "read_place",
@@ -31,6 +34,9 @@ __all__ = [
 
 #: A place by its number in an answer's list, from 1, or longitude and latitude near it.
 Taken: TypeAlias = "int | tuple[float, float]"
+
+#: Stands for a value that the camera states (see `sources.camera`).
+STATED = "exif"
 
 #: A single pixel size stands for the range from size / factor to size * factor: sizes are seldom known better.
 _GSD_FACTOR = 1.25
@@ -117,7 +123,8 @@ def read_range(value: Any, form: str = "a number above 0, or LO:HI") -> tuple[fl
     return low, high
 
 
-def _read_gsd(value: Any) -> tuple[float, float]:
+def read_gsd(value: Any) -> tuple[float, float]:
+    """Return the least and the greatest size of a pixel, metres."""
     form = "metres per pixel as SIZE or LO:HI: 0.3, 0.3+-10% or 0.3:0.6"
     center, off = _split_tolerance(value)
     low, high = read_range(center, form)
@@ -190,10 +197,13 @@ def _read_area(value: Any) -> Box:
     return find_area(value) if isinstance(value, str) else read_box(value)
 
 
-def _read_focal(value: Any) -> float | Literal["exif"]:
-    if isinstance(value, str) and value.lower() == "exif":
-        return "exif"
+def _read_focal(value: Any) -> float:
     return _read_number(value, math.ulp(0.0), 1e6, "pixels above 0, or exif")
+
+
+def _or_stated(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return what also reads "exif", for what the camera states."""
+    return lambda value: STATED if isinstance(value, str) and value.lower() == STATED else read(value)
 
 
 def _read_switch(value: Any) -> bool:
@@ -218,8 +228,8 @@ def _numbers(low: int, high: int) -> dict[str, Any]:
 _TABLE = (
     Hint(
         "near", "near", "LON,LAT,RADIUS", "Near",
-        "The middle lies within RADIUS metres of there.",
-        read_place, _numbers(3, 3), group="Where to look",
+        "The middle lies within RADIUS metres of there. exif: where the camera says; so --gsd and --heading.",
+        _or_stated(read_place), _numbers(3, 3), group="Where to look",
     ),
     Hint(
         "within", "within", "AREA", "In the country or state",
@@ -230,12 +240,12 @@ _TABLE = (
         "gsd", "gsd_m", "SIZE|LO:HI", "Pixel size, metres",
         "Pixel size, metres: 0.3, 0.3+-10% or 0.3:0.6. It is that at the middle; 0.3 alone stands for 0.24 to"
         " 0.375, a quarter more or less.",
-        _read_gsd, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]}, "0.1:12",
+        _or_stated(read_gsd), {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]}, "0.1:12",
     ),
     Hint(
         "heading", "heading_deg", "DEG[+-DEG]", "Heading, degrees",
         "Where up points, degrees from north: 90+-10. Clockwise; the second number is 10 if left out.",
-        _read_heading, {"oneOf": [{"type": "number"}, _numbers(2, 2)]},
+        _or_stated(_read_heading), {"oneOf": [{"type": "number"}, _numbers(2, 2)]},
     ),
     Hint(
         "north_up", "north_up", "", "Up is north",
@@ -251,7 +261,7 @@ _TABLE = (
     Hint(
         "focal", "focal_px", "PIXELS|exif", "Focal length, pixels",
         "Focal length in pixels, or as the EXIF says. That of the photograph, if one goes with a mask.",
-        _read_focal, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
+        _or_stated(_read_focal), {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
     ),
     Hint(
         "effort", "effort", "quick|full", "Effort",
@@ -286,17 +296,20 @@ def read_hint(name: str, value: Any) -> tuple[str, Any]:
         raise ValueError(f"{name}: {error}") from error
 
 
+def asked_of_camera(known: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of hints, by `Hint.goes_to`, that are to be what the camera states."""
+    return tuple(name for name, value in known.items() if value == STATED)
+
+
 def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptions:
     """Set the options of all stages from the hints that are known; other options stay unchanged.
 
     Parameters
     ----------
     known : mapping
-        Values by `Hint.goes_to`; None if unknown. The caller must look up a focal length "exif".
+        Values by `Hint.goes_to`; None if unknown. The caller must look up what the camera states, "exif".
     """
-    given = {name: value for name, value in known.items() if value is not None}
-    if given.get("focal_px") == "exif":
-        del given["focal_px"]
+    given = {name: value for name, value in known.items() if value not in (None, STATED)}
 
     def among(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}

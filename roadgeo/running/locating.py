@@ -184,7 +184,6 @@ class Locating:
         from roadgeo.reference.opening import digest_of
         from roadgeo.running.choosing import take_place
         from roadgeo.running.queries import locate_query
-        from roadgeo.sources.georeference import read_stated_middle
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
@@ -197,7 +196,6 @@ class Locating:
             sighting = locate_query(task.mask, question.references, options, reading, how=how, say=self.say)
             if self.options.taken is not None:
                 sighting = sighting.answering(take_place(sighting.location, self.options.taken, options))
-        sighting = sighting.showing(stated=None if sighting.location.place is None else read_stated_middle(task.mask))
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         # the clock of the search knows its own steps only: the rest was reading
         spent = location.seconds
@@ -240,17 +238,18 @@ class Locating:
             _LOG.warning("%s: no earlier answer lies in %s: searching first", visible(task.query), self.out_dir)
             return None
         kept = probability_path(paths)
-        return take_again(answer, taken, task.mask, kept, question.references, self.options.reading, options)
+        sighting = take_again(answer, taken, task.mask, kept, question.references, self.options.reading, options)
+        return sighting.showing(stated=read_stated_middle(task.mask))
 
     def search_options(self, task: Task) -> LocateOptions:
-        """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
+        """Return the options, with the hints that the image's camera states where they were asked for."""
         if not self.options.exif:
             return self.options.search
         from roadgeo.matching.hints import apply_hints
-        from roadgeo.sources.exif import focal_in_pixels
+        from roadgeo.sources.camera import read_stated
 
-        focal_px = focal_in_pixels(task.mask, self.options.images.get(task.mask))
-        return apply_hints(self.options.search, {"focal_px": focal_px})
+        stated = read_stated(self.options.exif, task.mask, self.options.images.get(task.mask))
+        return apply_hints(self.options.search, stated)
 
 
 def _without_views(outputs: OutputOptions) -> OutputOptions:

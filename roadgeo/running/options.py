@@ -100,8 +100,8 @@ class BatchOptions:
     ----------
     images : mapping of mask to photograph
         Drawn on the map instead of the masks.
-    exif : bool
-        Take the focal length from the photograph, or else the mask.
+    exif : tuple of str
+        Hints, by `matching.hints.Hint.goes_to`, that are taken from the photograph, or else the mask.
     dem : str
         Terrain model with the height of the ground below the camera; "" for none.
     skip_existing : bool
@@ -116,7 +116,7 @@ class BatchOptions:
     outputs: OutputOptions = field(default_factory=_usual_outputs)
     reading: ReadOptions = field(default_factory=ReadOptions)
     images: Mapping[str, str] = field(default_factory=dict)
-    exif: bool = False
+    exif: tuple[str, ...] = ()
     dem: str = ""
     skip_existing: bool = False
     taken: int | tuple[float, float] | None = None

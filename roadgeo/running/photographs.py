@@ -29,7 +29,7 @@ from roadgeo.roads.thresholds import spread_probability
 from roadgeo.running.options import ReadOptions, is_model
 from roadgeo.running.passes import Locate, PassRoads, Sighting, locate_passes
 from roadgeo.running.variants import in_pixels_of, resampled
-from roadgeo.sources.exif import estimate_gsd
+from roadgeo.sources.camera import estimate_gsd
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.sources.segmentation.photograph import Photograph, open_photograph

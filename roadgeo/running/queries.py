@@ -24,7 +24,7 @@ from roadgeo.running.photographs import Pass, call_segmenter, locate_photograph,
 from roadgeo.running.pictures import as_file
 from roadgeo.running.variants import undoing
 from roadgeo.sources.drawn_roads import draw_roads
-from roadgeo.sources.georeference import read_pixel_shape
+from roadgeo.sources.georeference import read_pixel_shape, read_stated_middle
 from roadgeo.sources.masks import MaskSource, is_photograph, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS
@@ -65,6 +65,8 @@ def locate_query(
     if query.mirrored and reading.mirror is None:
         location = sighting.location.saying("the georeference of the file mirrors it, which was undone")
         sighting = sighting.answering(location)
+    if isinstance(path, str):
+        sighting = sighting.showing(stated=read_stated_middle(path))
     return sighting
 
 

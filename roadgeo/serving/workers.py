@@ -215,12 +215,12 @@ def _reply(request: ImageRequest, references: Sequence[Any], say: Say = say_noth
 
 
 def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads: int) -> Reply:
-    from roadgeo.matching.hints import apply_hints
+    from roadgeo.matching.hints import apply_hints, asked_of_camera
     from roadgeo.running.choosing import take_place
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.queries import locate_query
     from roadgeo.serving.view import OWN, SEEN, read_sighting, write_view
-    from roadgeo.sources.exif import focal_in_pixels
+    from roadgeo.sources.camera import read_stated
     from roadgeo.storage.rasters import raster_size
     from roadgeo.workflows import LocateOptions, locate
 
@@ -236,8 +236,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
         detail = f"{width} x {height} pixels, expected at most {request.max_pixels:,} in all: reduce it"
         return Reply(413, {"detail": detail})
     hints = {**request.hints, "time_limit_s": request.time_limit_s}
-    if hints.get("focal_px") == "exif":
-        hints["focal_px"] = focal_in_pixels(request.path)
+    hints.update(read_stated(asked_of_camera(hints), request.path))
     taken, options = hints.pop("take", None), apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.

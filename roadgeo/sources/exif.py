@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 from datetime import UTC, datetime
 
 from roadgeo.errors import MaskError
 from roadgeo.storage.orientation import read_tag
-from roadgeo.storage.rasters import open_raster, raster_size
+from roadgeo.storage.rasters import open_raster
 
-__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length", "read_position", "read_time"]
+__all__ = ["number_of", "read_focal_length", "read_metadata", "read_position", "read_time"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
@@ -27,42 +26,13 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     MaskError
         The file cannot be read, or has no focal length.
     """
-    stated = _tags(path)[0].get(_FOCAL, "").strip("() ")
-    focal = _number(stated)
+    stated = read_metadata(path)[0].get(_FOCAL, "").strip("() ")
+    focal = number_of(stated)
     if not 1.0 <= focal <= 5000.0:
         raise MaskError(
             f"{path}: EXIF names no focal length (FocalLengthIn35mmFilm is {stated or 'missing'}); give it in pixels"
         )
     return focal / FILM_WIDTH_MM
-
-
-def focal_in_pixels(image: str, photo: str | None = None) -> float:
-    """Return the focal length in pixels of an image, as EXIF states it: its own, or its photograph's.
-
-    Raises
-    ------
-    MaskError
-        As for `read_focal_length`.
-    """
-    return read_focal_length(photo or image) * max(raster_size(image))
-
-
-def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
-    """Estimate the size of a photograph's pixels on the ground in metres, from its camera's height and focal length.
-
-    The height above the place of take-off, which drones note (XMP "RelativeAltitude"), is better than EXIF
-    "GPSAltitude", which counts from the sea. None where either is missing.
-    """
-    try:
-        tags, xmp = _tags(path)
-    except UnicodeDecodeError:  # damaged
-        return None
-    focal = _number(tags.get(_FOCAL, ""))
-    relative = re.search(r"RelativeAltitude\W{1,4}([-+]?\d+(\.\d+)?)", xmp)
-    height = _number(relative[1]) if relative else _number(tags.get("EXIF_GPSAltitude", ""))
-    if not (1.0 <= focal <= 5000.0 and 5.0 <= height <= 100_000.0):
-        return None
-    return height * FILM_WIDTH_MM / focal / max(raster_size(path))
 
 
 def read_time(path: str | os.PathLike[str]) -> float | None:
@@ -72,7 +42,7 @@ def read_time(path: str | os.PathLike[str]) -> float | None:
         moment = datetime.strptime(str(taken), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except ValueError:
         return None
-    return moment.timestamp() + _number(f"0.{part or 0}")
+    return moment.timestamp() + number_of(f"0.{part or 0}")
 
 
 def read_position(path: str | os.PathLike[str]) -> tuple[float, float] | None:
@@ -86,13 +56,13 @@ def read_position(path: str | os.PathLike[str]) -> tuple[float, float] | None:
     return -lon if west == "W" else lon, -lat if south == "S" else lat
 
 
-def _tags(path: str | os.PathLike[str]) -> tuple[dict[str, str], str]:
+def read_metadata(path: str | os.PathLike[str]) -> tuple[dict[str, str], str]:
     """Return a photograph's tags, with EXIF's, and its XMP."""
     with open_raster(path, upright=False) as source:
         return {**source.tags(), **source.tags(ns="EXIF")}, "".join(source.tags(ns="xml:XMP").values())
 
 
-def _number(text: str) -> float:
+def number_of(text: str) -> float:
     """Return the number in an EXIF value such as "(24)"; 0 without a number."""
     try:
         return float(text.strip("() "))

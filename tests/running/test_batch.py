@@ -213,8 +213,8 @@ def test_the_focal_length_of_exif_is_in_pixels_of_the_mask(tmp_path: Path) -> No
     photo, mask = jpeg_with_exif(tmp_path / "photo.jpg", 24), tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.zeros((400, 600), np.uint8))
     task = Task(str(mask), "mask")
-    options = BatchOptions(images={str(mask): str(photo)}, exif=True)
+    options = BatchOptions(images={str(mask): str(photo)}, exif=("focal_px",))
     work = Locating((), str(tmp_path), options, say_nothing)
     assert work.search_options(task).match.camera.focal_px == pytest.approx(400.0)
-    plain = replace(work, options=replace(options, exif=False))
+    plain = replace(work, options=replace(options, exif=()))
     assert plain.search_options(task).match.camera.focal_px is None

@@ -38,8 +38,9 @@ from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import open_shards
 from roadgeo.running.applying import apply_location
 from roadgeo.serving.requests import ending_of, read_query_string
+from roadgeo.sources.camera import estimate_gsd
 from roadgeo.sources.elevation import ground_heights
-from roadgeo.sources.exif import estimate_gsd, read_focal_length
+from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.georeference import read_georeference, read_stated_middle
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
