@@ -227,6 +227,7 @@ class Locating:
         from roadgeo.outputs.location_document import read_answer
         from roadgeo.outputs.paths import output_paths
         from roadgeo.running.choosing import take_again
+        from roadgeo.sources.georeference import read_stated_middle
 
         paths, taken = output_paths(self.out_dir, task.stem), self.options.taken
         try:
