@@ -20,11 +20,11 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.evaluation.landscape import Landscape, visible_intersections
 from roadgeo.evaluation.noise import NoiseModel, Range, draw_mask
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.pinhole import View, make_view, sees_ground
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["FLIGHT_NOISE", "Flight", "FlightOptions", "simulate_flight"]
+__all__ = ["FLIGHT_NOISE", "Flight", "FlightOptions", "simulate_flight", "with_fault"]
 
 #: Draws of a flight before it is given up.
 MAX_TRIES = 3000
@@ -104,8 +104,11 @@ class Flight:
         """Draw the frames one after another, (H, W) uint8, roads 255."""
         rng = _generator(self.options, self.number, "masks")
         seen = replace(self.landscape, graph=self._seen)
+        shown = None
         for view in self.views:
-            yield draw_mask(seen, view, self.options.noise, self.options.road_width_m, rng)[0]
+            if view is not shown:  # the picture of a link that stands still is the same to the pixel
+                shown, mask = view, draw_mask(seen, view, self.options.noise, self.options.road_width_m, rng)[0]
+            yield mask
 
     @cached_property
     def _seen(self) -> RoadGraph:
@@ -137,6 +140,32 @@ def simulate_flight(landscape: Landscape, options: FlightOptions, number: int) -
         f"no flight whose frames show {least} to {most} intersections was found in {MAX_TRIES} draws; give a larger"
         " map, or ask for other ones"
     )
+
+
+def with_fault(flight: Flight, fault: str, at: int, length: int) -> Flight:
+    """Return a flight whose link fails at a frame, for a number of frames.
+
+    `fault`: "frozen", the frame is shown again and again; "missing", no frame comes; "slipped", the aircraft is
+    displaced to the right by as far as it flies meanwhile. The flight then goes on.
+    """
+    views = flight.views
+    if fault == "frozen":
+        views = (*views[:at], *[views[at]] * length, *views[at + length :])
+    elif fault == "missing":
+        views = (*views[:at], *views[at + length :])
+    else:
+        east, north = views[at + length].homography(_middle(flight)) - views[at].homography(_middle(flight))
+        views = (*views[:at], *(_moved(view, north, -east) for view in views[at:]))
+    rng = _generator(flight.options, flight.number, fault)
+    return replace(flight, views=views, motion=_motion(views, flight.options.motion_px, rng))
+
+
+def _middle(flight: Flight) -> FloatArray:
+    return np.array(flight.options.size_px) / 2.0
+
+
+def _moved(view: View, east_m: float, north_m: float) -> View:
+    return replace(view, homography=Homography(shift(east_m, north_m) @ view.homography.matrix))
 
 
 def _generator(options: FlightOptions, number: int, what: str) -> np.random.Generator:
