@@ -30,7 +30,13 @@ from roadgeo.reference.reference import Reference
 FAULTS = ("frozen", "missing", "slipped")
 #: As a video shows it: a frame moves by a twentieth of its height.
 VIEWS = FlightOptions(
-    size_px=(800, 600), n_frames=(36, 36), overlap=0.95, gsd_m=(0.7, 1.2), turn_deg=0.5, sway_deg=0.2, intersections=(4, 60)
+    size_px=(800, 600),
+    n_frames=(36, 36),
+    overlap=0.95,
+    gsd_m=(0.7, 1.2),
+    turn_deg=0.5,
+    sway_deg=0.2,
+    intersections=(4, 60),
 )
 #: Frames are wrong beyond this number of standard deviations; a motion is, beyond this number of pixels.
 WRONG_SIGMAS, WRONG_PX = 5.0, 50.0
@@ -81,7 +87,9 @@ def fly(flight: Flight, reference: Reference) -> tuple[list[Tracked], list[float
     return [known[k] for k in sorted(known)], motion_px
 
 
-def judge(flight: Flight, tracked: Sequence[Tracked], motion_px: Sequence[float | None]) -> Iterator[tuple[str, float, float]]:
+def judge(
+    flight: Flight, tracked: Sequence[Tracked], motion_px: Sequence[float | None]
+) -> Iterator[tuple[str, float, float]]:
     """Yield of each frame what was wrong first ("" for nothing), the error and the standard deviation, metres."""
     for view, state, px in zip(flight.views, tracked, motion_px, strict=True):
         if state.pose is None:
@@ -122,24 +130,45 @@ def main() -> None:
         for number in range(given.flights):
             for path, landscape in landscapes.items():
                 for fault in FAULTS:
-                    flight, at, length = draw(landscape, FlightOptions(**{**vars(VIEWS), "seed": given.seed}), number, fault)
+                    flight, at, length = draw(
+                        landscape, FlightOptions(**{**vars(VIEWS), "seed": given.seed}), number, fault
+                    )
                     tracked, motion_px = fly(flight, open_reference(path))
                     frames = list(judge(flight, tracked, motion_px))
                     wrong = [frame for frame in frames if frame[0]]
                     _, worst_m, sigma_m = max(wrong, key=lambda frame: frame[1], default=("", 0.0, 0.0))
                     right = [not stage and error < 50.0 for stage, error, _ in frames]
-                    results.append(Result(
-                        path.stem, number, fault, at, length, len(frames), sum(np.isfinite(error) for _, error, _ in frames),
-                        len(wrong), round(worst_m, 1), round(sigma_m, 2), wrong[0][0] if wrong else "",
-                        any(state.status in ("lost", "predicted") for state in tracked[at:]),
-                        sum(right[-LAST:]) >= LAST / 2,
-                    ))
+                    results.append(
+                        Result(
+                            path.stem,
+                            number,
+                            fault,
+                            at,
+                            length,
+                            len(frames),
+                            sum(np.isfinite(error) for _, error, _ in frames),
+                            len(wrong),
+                            round(worst_m, 1),
+                            round(sigma_m, 2),
+                            wrong[0][0] if wrong else "",
+                            any(state.status in ("lost", "predicted") for state in tracked[at:]),
+                            sum(right[-LAST:]) >= LAST / 2,
+                        )
+                    )
                     writer.writerow(asdict(results[-1]))
                     out.flush()
                     print(*asdict(results[-1]).values(), flush=True)
                     if given.frames:
                         for k, (state, px, (stage, error, sigma)) in enumerate(zip(tracked, motion_px, frames)):
-                            print("   ", k, state.status, f"{state.log10_odds:.1f}", px and round(px), f"{error:.1f} {sigma:.2f}", stage)
+                            print(
+                                "   ",
+                                k,
+                                state.status,
+                                f"{state.log10_odds:.1f}",
+                                px and round(px),
+                                f"{error:.1f} {sigma:.2f}",
+                                stage,
+                            )
     summarize(results)
 
 

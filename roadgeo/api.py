@@ -296,7 +296,7 @@ def verify(
     reference : Reference, path or name, or several
         As of `locate`.
     tolerance, reach : float
-        It agrees if it is off by less, on average over the frame; nothing beyond `reach` is looked at. Metres.
+        It agrees if it is off by less, on average over the frame; nothing beyond `reach` is reported. Metres.
     max_turn : float
         By how much it may be turned, degrees.
     crs : str

@@ -56,7 +56,7 @@ _OPTIONS = (
         "An image agrees if, on average over the frame, it is off by less.",
         type=click.FloatRange(0.1, 100), default=3.0, show_default=True),
     row("--reach", "METRES", OTHERS,
-        "How far off it may be: nothing beyond is looked at.",
+        "How far off it may be: nothing beyond is reported.",
         type=click.FloatRange(20, 2000), default=350.0, show_default=True, rare=True),
     row("--max-turn", "DEG", OTHERS,
         "By how much it may be turned.", type=click.FloatRange(0, 45), default=6.0, show_default=True, rare=True),
@@ -72,8 +72,8 @@ def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: An
     """Check whether georeferenced IMAGEs are where they claim to be, by the roads they show.
 
     An image is a road mask or a photograph with a place: a geotransform, control
-    points, or a world file. Its roads are held against a reference's, from the given place outwards; the world
-    is never searched (`roadgeo locate` does that). Each image
+    points, or a world file. Its roads are compared with a reference's at that place and within --reach of it; the
+    rest of the map is searched only for a place that explains more. Each image
 
     \b
       agrees      within --tolerance
@@ -185,6 +185,6 @@ def _report(verified: Verified, files: list[Path]) -> None:
         return
     tell(describe(document))
     if is_set("verbose") and document.get("log10_lead") is not None:
-        tell(f"  leads any other place nearby by 10^{document['log10_lead']:.1f}")
+        tell(f"  score {document['log10_lead']:.1f}")
     if files:
         tell(f"  wrote {', '.join(map(str, files))}")

@@ -22,7 +22,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.matching.checking import CheckOptions, check_place
-from roadgeo.matching.scene import trace_query
+from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
@@ -145,9 +145,9 @@ class _Net:
             return math.isnan(tracked.log10_odds)
         if tracked.status != "located" or tracked.pose is None or tracked.reference is None:
             return False
-        scene = trace_query(tracked.frame.mask)[0]
+        query = read_query(tracked.frame.mask)
         start = tracked.pose.homography.matrix @ PIXEL_TO_PLANE
-        checked = check_place(start / start[2, 2], scene, tracked.reference.index, _CHECK)
+        checked = check_place(start / start[2, 2], query, tracked.reference.index, _CHECK, beyond=False)
         return checked.verdict == "agrees"
 
 

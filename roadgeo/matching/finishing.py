@@ -58,7 +58,7 @@ def measure_corners(estimator: TripleEstimator, best: Place) -> Place:
 
     A place is fitted to the whole frame only if its score may be reported: every part of a map has a best place.
     """
-    if best.refined is None or not estimator.options.lens:
+    if best.refined is None:
         return best
     scene = estimator.scene
     if best.lens_k1 == 0.0:

@@ -35,7 +35,7 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["N_KNOWN", "Compared", "Rivals", "log10_gap", "similar_places"]
+__all__ = ["N_KNOWN", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -293,9 +293,9 @@ def similar_places(
         proposed += [(shift.share, move_about(best.center, shift) @ turned) for shift in shifts]
     proposed.sort(key=lambda place: -place[0])
     starts = (Place(scene, index, matrix) for _, matrix in proposed[: around.n_places])
-    fits = (_fit(start, match, _N_POINTS) for start in starts)
+    fits = (fitted(start, match, _N_POINTS) for start in starts)
     roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
-    finely = (_fit(other.place, match, None) for other in roughly[:_N_FITTED])
+    finely = (fitted(other.place, match, None) for other in roughly[:_N_FITTED])
     return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[_N_FITTED:]]
 
 
@@ -317,11 +317,11 @@ def log10_gap(best: float, others: Sequence[float]) -> float:
     return n * math.log10(1.0 + gap / (n * max(usual, _LEAST_SPACING)))
 
 
-def _fit(start: Place, match: MatchOptions, n_points: int | None) -> Place:
-    """Refine a place; return the start if the refinement diverges."""
+def fitted(start: Place, match: MatchOptions, n_points: int | None) -> Place:
+    """Return a place refined; the start if the refinement diverges."""
     args = start.matrix, start.scene, start.index, start.matched
     refined = refine(*args, match.refine, n_points, held=True)
     if refined is None or judge(refined.matrix, start.scene.size, match.camera) is not None:
         return start
-    fitted = start.at(refined)
-    return start if abs(math.log(fitted.gsd_m / start.gsd_m)) > math.log(1.1) else fitted
+    place = start.at(refined)
+    return start if abs(math.log(place.gsd_m / start.gsd_m)) > math.log(1.1) else place

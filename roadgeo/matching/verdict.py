@@ -25,7 +25,7 @@ from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query, Scene
 from roadgeo.matching.veto import broken_hints
 
-__all__ = ["decide", "georeference", "match_again", "searched_within"]
+__all__ = ["away", "decide", "georeference", "match_again", "searched_within"]
 
 
 #: Reason if the clock ended a search: the only case in which an answer depends on the machine and its load.
@@ -238,13 +238,13 @@ def _refuse(
 def _fits_elsewhere(location: Location, listed: Sequence[Place], options: LocateOptions) -> Location:
     """Refuse what hints led to: the first of the places, which they exclude, explains more."""
     better, *hinted = listed
-    where = f"{_away(better.apart_m(hinted[0]))} away" if hinted else "elsewhere"
+    where = f"{away(better.apart_m(hinted[0]))} away" if hinted else "elsewhere"
     ways = broken_hints(better, options)
     reason = f"the roads fit better {where}, {', and '.join(ways)}" if ways else f"the roads fit better {where}"
     return replace(_at(location, listed, None, options), reason=reason, reason_code=Reason.FITS_ELSEWHERE)
 
 
-def _away(metres: float) -> str:
+def away(metres: float) -> str:
     """Write a distance, in metres or kilometres."""
     return f"{metres:.0f} m" if metres < 1000.0 else f"{metres / 1000.0:.1f} km"
 

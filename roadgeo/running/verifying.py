@@ -148,12 +148,12 @@ def _count_inside(place: Georeference, reference: Reference) -> int:
 def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     """Read the roads of a mask or a photograph, at several thresholds if need be, and check the place with each."""
     results: list[Checked] = []
-    width = image.place.size[0]
+    aspect, is_mirrored = image.place.pixel_shape()
 
     def check(mask: RoadMask, _: Sequence[AnyReference], __: LocateOptions) -> Location:
         query = read_query(mask)
-        coarser = np.diag([width / mask.shape[1]] * 2 + [1.0])  # large photographs are segmented on a coarser grid
-        checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)
+        there = start @ _to_image(mask.shape, image.place.size, is_mirrored) @ PIXEL_TO_PLANE
+        checked = check_place(there, query, reference.index, image.settings.options)
         results.append(checked)
         is_decided = checked.verdict != "unknown"
         return Location(
@@ -164,11 +164,18 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     options = LocateOptions()
     match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
     search = replace(options.search, time_limit_s=60.0)
-    reading = replace(image.settings.reading, mirror=False, aspect=1.0)  # its georeference is what is checked
+    reading = replace(image.settings.reading, mirror=is_mirrored, aspect=aspect or 1.0)
     locate_query(image.name, [reference], replace(options, match=match, search=search), reading, how=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")
     return next((checked for checked in results if checked.verdict != "unknown"), results[0])
+
+
+def _to_image(shape: tuple[int, int], size: tuple[int, int], is_mirrored: bool) -> FloatArray:
+    """Return the map (3, 3) from pixels of a mask of (H, W), which may be coarser and mirrored, to an image's."""
+    coarser = np.diag([size[0] / shape[1], size[1] / shape[0], 1.0])
+    over = np.array([[-1.0, 0.0, shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(coarser @ over) if is_mirrored else coarser
 
 
 # --- telling ----------------------------------------------------------------------------------------------------------

@@ -1,14 +1,20 @@
 """Given places on made-up towns: right, off, or not to be judged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from shapely import affinity
 from worlds.motorways import motorways
-from worlds.scenes import Sight, camera, look, scene_of, soft
+from worlds.scenes import PLANE, Sight, camera, look, random_lines, scene_of, soft
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching import checking
+from roadgeo.location import Seconds
 from roadgeo.matching.checking import check_place
+from roadgeo.matching.index import build_index
+from roadgeo.matching.scene import Query
 from roadgeo.matching.shifts import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.roads.network import build_network
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
 
@@ -19,65 +25,76 @@ def sights(town, request):
     found = []
     for seed, heading in ((1, 10.0), (2, 200.0), (3, 300.0)):
         truth = camera((1700.0 + 200 * seed, 2000.0), (900, 700), 1.0, heading_deg=heading)
-        scene = scene_of(look(town[0], truth, (900, 700), SIGHT, seed), (900, 700))
-        found.append((truth, soft(scene, seed=seed) if request.param == "soft" else scene))
+        query = query_of(look(town[0], truth, (900, 700), SIGHT, seed), (900, 700))
+        found.append((truth, replace(query, scene=soft(query.scene, seed=seed)) if request.param == "soft" else query))
     return found
 
 
-def lied(truth, scene, shift):
-    """Where a georeference that is off by a shift puts the scene."""
-    return move_about(Homography(truth)(scene.center), shift) @ truth
+def query_of(graph, size):
+    """A query whose roads are known."""
+    return Query("", scene_of(graph, size), graph, Seconds())
+
+
+def lied(truth, query, shift):
+    """Where a georeference that is off by a shift puts the query."""
+    return move_about(Homography(truth)(query.scene.center), shift) @ truth
 
 
 def test_a_right_place_agrees(town, sights) -> None:
-    for truth, scene in sights:
-        found = check_place(truth, scene, town[1])
+    for truth, query in sights:
+        found = check_place(truth, query, town[1])
         assert found.verdict == "agrees", found.reason
         assert found.agreeing == pytest.approx(found.agreeing_as_given, abs=0.05)
-
-
-def test_points_that_have_a_twin_beside_them_are_left_out_with_all_that_is_known_of_them(
-    town, sights, monkeypatch
-) -> None:
-    """As if a block were a dual carriageway."""
-    truth, scene = sights[0]
-    for twin_m in (80.0, 100.0):
-        monkeypatch.setattr(checking, "_TWIN_M", twin_m)
-        assert check_place(truth, scene, town[1]).verdict in ("agrees", "unknown")
 
 
 @pytest.mark.parametrize(
     "shift", [Shift(6, 0, 0, 1, 0), Shift(-3, -4, 1, 1, 0), Shift(80, -60, -5, 1, 0), Shift(-200, 220, 3, 1, 0)]
 )
 def test_a_wrong_one_is_off_by_what_it_was_moved_by(town, sights, shift) -> None:
-    for truth, scene in sights:
-        found = check_place(lied(truth, scene, shift), scene, town[1])
+    for truth, query in sights:
+        found = check_place(lied(truth, query, shift), query, town[1])
         assert found.verdict == "off", found.reason
-        center = Homography(found.matrix)(scene.center)
-        assert np.hypot(*(center - Homography(truth)(scene.center))) < 1.5
+        middle = np.array(query.scene.size) / 2.0
+        center = Homography(found.placement.matrix)(middle)
+        assert np.hypot(*(center - Homography(truth)(query.scene.center))) < 1.5
         assert found.displacement.turn_deg == pytest.approx(-shift.turn_deg, abs=0.2)
         assert np.hypot(found.displacement.east_m + shift.east_m, found.displacement.north_m + shift.north_m) < 1.5
 
 
 def test_what_lies_beyond_the_reach_or_on_another_map_is_not_judged(town, sights) -> None:
-    truth, scene = sights[0]
+    truth, query = sights[0]
     for shift in (Shift(700, 500, 0, 1, 0), Shift(0, 0, 90, 1, 0)):
-        assert check_place(lied(truth, scene, shift), scene, town[1]).verdict == "unknown"
-    away = check_place(lied(truth, scene, Shift(50_000, 0, 0, 1, 0)), scene, town[1])
+        found = check_place(lied(truth, query, shift), query, town[1])
+        assert found.verdict == "unknown"
+        assert "fit better" in found.reason
+    away = check_place(lied(truth, query, Shift(50_000, 0, 0, 1, 0)), query, town[1])
     assert (away.verdict, away.displacement) == ("unknown", None)
     assert "not on this map" in away.reason
 
 
+@pytest.mark.parametrize("away_m", [1500.0, 4000.0])
+def test_a_place_beyond_the_reach_that_explains_more_refutes_one_within(away_m) -> None:
+    """A district, and what it was before it grew, which stands out from all within reach."""
+    lines, truth, size = random_lines(31, 1200.0), camera((600, 600), (800, 800), 1.0, heading_deg=25.0), (800, 800)
+    before = [affinity.translate(line, away_m) for k, line in enumerate(lines) if k % 5]
+    index = build_index(build_network(lines + before, PLANE, {"name": "twice"}))
+    query = query_of(look(build_network(lines, PLANE, {"name": "once"}), truth, size), size)
+    assert check_place(lied(truth, query, Shift(60, 0, 0, 1, 0)), query, index).verdict == "off"
+    found = check_place(lied(truth, query, Shift(away_m + 60.0, 0, 0, 1, 0)), query, index)
+    assert (found.verdict, found.displacement) == ("unknown", None)
+    assert "the roads fit better" in found.reason
+
+
 def test_hardly_a_road_is_no_evidence(town) -> None:
     truth = camera((2000.0, 2000.0), (60, 60), 1.0)
-    found = check_place(truth, scene_of(look(town[0], truth, (60, 60)), (60, 60)), town[1])
+    found = check_place(truth, query_of(look(town[0], truth, (60, 60)), (60, 60)), town[1])
     assert found.verdict == "unknown"
     assert "too few roads" in found.reason
 
 
 def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:
-    truth, scene = sights[1]
-    best = search_nearby(lied(truth, scene, Shift(150, -90, 4, 1, 0)), scene, town[1], LocalSearchOptions())[0]
+    truth, query = sights[1]
+    best = search_nearby(lied(truth, query, Shift(150, -90, 4, 1, 0)), query.scene, town[1], LocalSearchOptions())[0]
     assert (best.east_m, best.north_m) == pytest.approx((-150, 90), abs=8)
     assert best.turn_deg == pytest.approx(-4, abs=1.2)
 
@@ -86,6 +103,6 @@ def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:
 def test_two_roads_of_a_mask_that_are_one_on_the_map_do_not_put_it_off(town, heading) -> None:
     """A fit to either of them would, by half of how far they are apart; here all roads are such."""
     truth = camera((2000.0, 2000.0), (900, 700), 1.0, heading_deg=heading)
-    scene = scene_of(look(motorways(town[0], lambda at: True, 20.0), truth, (900, 700)), (900, 700))
-    found = check_place(truth, scene, town[1])
+    query = query_of(look(motorways(town[0], lambda at: True, 20.0), truth, (900, 700)), (900, 700))
+    found = check_place(truth, query, town[1])
     assert found.verdict != "off", found.reason

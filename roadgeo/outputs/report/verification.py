@@ -117,7 +117,7 @@ def _numbers(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     if document.get("agreeing") is not None:
         rows.append(("Roads that agree", f"{document['agreeing']:.0%}, as it is {document['agreeing_as_given']:.0%}"))
     if document.get("log10_lead") is not None:
-        rows.append(("Leads any other place by", f"10^{document['log10_lead']:.1f}"))
+        rows.append(("Score", f"{document['log10_lead']:.1f}"))
     if center is not None:
         rows.append(("Middle, as it says", f"{center['lon']:.6f}, {center['lat']:.6f} (longitude, latitude)"))
         rows.append(("Its place is told by", str(document.get("georeference", ""))))
