@@ -1,6 +1,6 @@
 """How flights are followed whose link fails: simulated ones over real cities, their motion taken from their masks.
 
-    OMP_NUM_THREADS=1 python examples/faulty_flights.py OUT.csv porto.gpkg liege.gpkg [--flights 7] [--seed 7]
+    OMP_NUM_THREADS=1 python examples/faulty_flights.py OUT.csv porto.gpkg liege.gpkg [--flights 3] [--seed 7]
 
 In each flight a frame is repeated, frames are missing, or the aircraft is displaced, for 3 to 8 frames; then the flight
 goes on. Counted are frames that lie farther from the truth than five standard deviations, the stage that first put
@@ -11,8 +11,8 @@ import argparse
 import csv
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
-from itertools import pairwise
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise, product
 from pathlib import Path
 
 import cv2
@@ -40,8 +40,8 @@ VIEWS = FlightOptions(
 )
 #: Frames are wrong beyond this number of standard deviations; a motion is, beyond this number of pixels.
 WRONG_SIGMAS, WRONG_PX = 5.0, 50.0
-#: Frames at the end of a flight, half of which must be right for it to be found again.
-LAST = 6
+#: Frames at the end of a flight, half of which must lie within so many metres of the truth for it to be found again.
+LAST, RIGHT_M = 6, 50.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,23 @@ def judge(
         yield stage if error > WRONG_SIGMAS * sigma else "", error, sigma
 
 
+def measure(path: Path, landscape: Landscape, options: FlightOptions, number: int, fault: str) -> Result:
+    """Draw a flight with a fault, follow it, and describe what came of it."""
+    flight, at, length = draw(landscape, options, number, fault)
+    tracked, motion_px = fly(flight, open_reference(path))
+    frames = list(judge(flight, tracked, motion_px))
+    wrong = [frame for frame in frames if frame[0]]
+    stage, _, _ = wrong[0] if wrong else ("", 0.0, 0.0)
+    _, worst_m, sigma_m = max(wrong, key=lambda frame: frame[1], default=("", 0.0, 0.0))
+    placed = sum(np.isfinite(error) for _, error, _ in frames)
+    noticed = any(state.status in ("lost", "predicted") for state in tracked[at:])
+    found_again = sum(not stage and error < RIGHT_M for stage, error, _ in frames[-LAST:]) >= LAST / 2
+    return Result(
+        path.stem, number, fault, at, length, len(frames), placed,
+        len(wrong), round(worst_m, 1), round(sigma_m, 2), stage, noticed, found_again,
+    )  # fmt: skip
+
+
 def summarize(results: Sequence[Result]) -> None:
     """Print a line for each fault, and for all."""
     for fault in (*FAULTS, "all"):
@@ -108,7 +125,8 @@ def summarize(results: Sequence[Result]) -> None:
         stages = dict(Counter(result.stage for result in here if result.stage))
         print(
             f"{fault:8} {len(here)} flights: {sum(result.wrong > 0 for result in here)} with wrong frames"
-            f" ({sum(result.wrong for result in here)}; first by {stages}), {sum(result.noticed for result in here)} noticed,"
+            f" ({sum(result.wrong for result in here)}; the first by {stages}),"
+            f" {sum(result.noticed for result in here)} noticed,"
             f" {sum(result.found_again for result in here)} found again"
         )
 
@@ -117,58 +135,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("references", nargs="+", type=Path, help="REF.gpkg of each city")
-    parser.add_argument("--flights", type=int, default=7, help="per city and fault")
+    parser.add_argument("--flights", type=int, default=3, help="per city and fault")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", action="store_true", help="print each frame")
     given = parser.parse_args()
     cv2.setNumThreads(1)
-    results = []
+    options, results = replace(VIEWS, seed=given.seed), []
     landscapes = {path: Landscape.from_network(read_network(path)) for path in given.references}
     with given.out.open("w", newline="") as out:
         writer = csv.DictWriter(out, [field.name for field in fields(Result)])
         writer.writeheader()
-        for number in range(given.flights):
-            for path, landscape in landscapes.items():
-                for fault in FAULTS:
-                    flight, at, length = draw(
-                        landscape, FlightOptions(**{**vars(VIEWS), "seed": given.seed}), number, fault
-                    )
-                    tracked, motion_px = fly(flight, open_reference(path))
-                    frames = list(judge(flight, tracked, motion_px))
-                    wrong = [frame for frame in frames if frame[0]]
-                    _, worst_m, sigma_m = max(wrong, key=lambda frame: frame[1], default=("", 0.0, 0.0))
-                    right = [not stage and error < 50.0 for stage, error, _ in frames]
-                    results.append(
-                        Result(
-                            path.stem,
-                            number,
-                            fault,
-                            at,
-                            length,
-                            len(frames),
-                            sum(np.isfinite(error) for _, error, _ in frames),
-                            len(wrong),
-                            round(worst_m, 1),
-                            round(sigma_m, 2),
-                            wrong[0][0] if wrong else "",
-                            any(state.status in ("lost", "predicted") for state in tracked[at:]),
-                            sum(right[-LAST:]) >= LAST / 2,
-                        )
-                    )
-                    writer.writerow(asdict(results[-1]))
-                    out.flush()
-                    print(*asdict(results[-1]).values(), flush=True)
-                    if given.frames:
-                        for k, (state, px, (stage, error, sigma)) in enumerate(zip(tracked, motion_px, frames)):
-                            print(
-                                "   ",
-                                k,
-                                state.status,
-                                f"{state.log10_odds:.1f}",
-                                px and round(px),
-                                f"{error:.1f} {sigma:.2f}",
-                                stage,
-                            )
+        for number, (path, landscape), fault in product(range(given.flights), landscapes.items(), FAULTS):
+            results.append(measure(path, landscape, options, number, fault))
+            writer.writerow(asdict(results[-1]))
+            out.flush()
+            print(*asdict(results[-1]).values(), flush=True)
     summarize(results)
 
 
