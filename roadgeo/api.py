@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack
 
 from roadgeo.errors import MaskError, name_package
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.matching.hints import STATED, apply_hints, asked_of_camera, read_hint
+from roadgeo.matching.hints import HINTS, STATED, apply_hints, asked_of_camera, read_hint
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
 from roadgeo.reference.reference import BuildOptions, Reference
@@ -31,11 +33,55 @@ if TYPE_CHECKING:
 
 __all__ = ["Answer", "fence", "index", "locate", "track", "vectorize", "verify"]
 
+_KEYWORD = inspect.Parameter.KEYWORD_ONLY
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
 
 #: A file or folder, or several.
 Files: TypeAlias = "str | os.PathLike[str] | Iterable[str | os.PathLike[str]]"
+
+
+class FlightHints(TypedDict, total=False):
+    """What may be known of a flight (see the table of `matching.hints`)."""
+
+    near: tuple[float, float, float] | str | None
+    within: str | Box | None
+    gsd: float | tuple[float, float] | str | None
+    max_tilt: float | None
+    time_limit: float | None
+
+
+class Hints(FlightHints, total=False):
+    """What may be known of an image (see the table of `matching.hints`)."""
+
+    heading: float | tuple[float, float] | str | None
+    north_up: bool | None
+    focal: float | Literal["exif"] | None
+    effort: Literal["quick", "full"] | None
+
+
+def _hinted(known: type) -> Callable[[Function], Function]:
+    """Write hints into a function's signature and docstring, as the table has them, and refuse other keywords."""
+
+    def write(function: Function) -> Function:
+        own = inspect.signature(function)
+        kinds = {name: known.__annotations__[name].__forward_arg__ for name in HINTS if name in known.__annotations__}
+        hints = [inspect.Parameter(name, _KEYWORD, default=None, annotation=kind) for name, kind in kinds.items()]
+        signature = own.replace(parameters=[*list(own.parameters.values())[:-1], *hints])
+
+        @wraps(function)
+        def call(*given: Any, **named: Any) -> Any:
+            signature.bind(*given, **named)
+            return function(*given, **named)
+
+        said = "".join(f"    {name} : {HINTS[name].form or 'bool'}\n        {HINTS[name].told}\n" for name in kinds)
+        call.__signature__ = signature  # type: ignore[attr-defined]
+        call.__doc__ = re.sub(r"    \*\*hints\n(        .*\n)+", rf"\g<0>{said}", function.__doc__ or "")
+        return call  # type: ignore[return-value]
+
+    return write
 
 
 def fence(read: Files = (), write: Files = (), *, network: bool = False) -> bool:
@@ -153,21 +199,14 @@ def _is_place(roads: Any) -> bool:
     return isinstance(roads, str) and not Path(roads).exists() and not re.search(r"[/\\]|\.\w{2,9}$", roads)
 
 
+@_hinted(Hints)
 def locate(
     mask: Any,
     reference: References = (),
     options: LocateOptions | None = None,
     *,
-    gsd: float | tuple[float, float] | str | None = None,
-    near: tuple[float, float, float] | str | None = None,
-    within: str | Box | None = None,
-    max_tilt: float | None = None,
-    north_up: bool | None = None,
-    heading: float | tuple[float, float] | str | None = None,
-    focal: float | Literal["exif"] | None = None,
-    effort: Literal["quick", "full"] | None = None,
-    time_limit: float | None = None,
     take: int | tuple[float, float] | None = None,
+    **hints: Unpack[Hints],
 ) -> Answer:
     """Find where a photograph, or a mask of roads, lies on a map. Nothing is written.
 
@@ -185,29 +224,13 @@ def locate(
     reference : Reference, path or name, or several
         Files REF.gpkg, or names in the library. Default: all of the library.
     options : LocateOptions
-        Everything that can be chosen. The following override it; texts are read as on the command line.
-    near : (longitude, latitude, metres)
-        The middle lies within that distance of this place. "exif", here and for `gsd`, `heading` and `focal`: as the
-        camera states it in a file's EXIF and XMP, with the errors of such statements.
-    within : str or (west, south, east, north)
-        The middle lies in this country or state, or within these degrees.
-    gsd : float or (float, float)
-        Metres per pixel at the middle, at least and at most; a single value stands for 0.8 to 1.25 times it.
-    heading : float or (float, float)
-        Direction of the image's up, degrees clockwise from north, and by how much it may be off (default 10).
-    north_up : bool
-        The image's up is grid north of the reference, within 5 degrees.
-    max_tilt : float
-        Greatest angle of the camera from the vertical, degrees.
-    focal : float or "exif"
-        Focal length in pixels of the image.
-    effort : "quick" or "full"
-        Whether the search ends early, or roads alone are searched too (the default).
-    time_limit : float
-        Seconds after which the search stops.
+        Everything that can be chosen. Hints override it.
     take : int or (longitude, latitude)
         The place, counted from 1 among `places` or nearest to this one, that is the answer; its status is "chosen".
         With an answer that is there already, `answer.take` takes a place without another search.
+    **hints
+        What is known of the image; texts are read as on the command line. "exif" for `near`, `gsd`, `heading` or
+        `focal`: as the camera states it in a file's EXIF and XMP, with the errors of such statements.
 
     Raises
     ------
@@ -228,23 +251,13 @@ def locate(
     from roadgeo.running.queries import locate_query
     from roadgeo.workflows import locate as locate_mask
 
-    given = {
-        "near": near,
-        "within": within,
-        "gsd": gsd,
-        "heading": heading,
-        "north_up": north_up,
-        "max_tilt": max_tilt,
-        "focal": focal,
-        "effort": effort,
-        "time_limit": time_limit,
-    }
-    options = _with_hints(options or LocateOptions(), given, mask)
+    options = _with_hints(options or LocateOptions(), hints, mask)
     if isinstance(take, int) and take < 1:
         raise ValueError(f"take={take!r}: places are counted from 1")
     references = _open(reference)
     meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
+        near = hints.get("near")
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
     picture = None if isinstance(mask, RoadMask) else read_picture(mask)
     if picture is None:
@@ -262,7 +275,7 @@ def locate(
     return Answer(**{**answer, **origin}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
 
 
-def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
+def _with_hints(options: LocateOptions, given: Mapping[str, Any], image: Any) -> LocateOptions:
     """Put what is known where the search looks for it."""
     hints = dict(read_hint(name, value) for name, value in given.items() if value is not None)
     if asked := asked_of_camera(hints):
@@ -320,6 +333,7 @@ def verify(
     return verify_image(os.fspath(image), _open(reference), VerifyRun(options=options, crs=crs))
 
 
+@_hinted(FlightHints)
 def track(
     frames: Any,
     reference: References = (),
@@ -329,12 +343,8 @@ def track(
     every: float = 1.0,
     interval: float = 1.0,
     start: datetime | None = None,
-    gsd: float | tuple[float, float] | str | None = None,
-    near: tuple[float, float, float] | str | None = None,
-    within: str | Box | None = None,
-    max_tilt: float | None = None,
     focal: float | None = None,
-    time_limit: float = 10.0,
+    **hints: Unpack[FlightHints],
 ) -> list[Row]:
     """Follow a flight over the map, frame by frame, as `roadgeo track` does. Nothing is written.
 
@@ -356,8 +366,10 @@ def track(
         Seconds between the frames that are taken of a video, and between images.
     start : datetime
         When the first frame was taken.
-    gsd, near, within, max_tilt, focal, time_limit
-        As of `locate`; with `focal`, pixels, the places of the camera are given too.
+    focal : float
+        Focal length, pixels: the places of the camera are given too.
+    **hints
+        As of `locate`; each search is stopped after 10 seconds by default.
 
     Returns
     -------
@@ -376,10 +388,9 @@ def track(
     from roadgeo.flights.rows import make_rows
     from roadgeo.flights.tracker import TrackOptions, latest
 
-    given = {"gsd": gsd, "near": near, "within": within, "max_tilt": max_tilt, "time_limit": time_limit}
-    options = TrackOptions(locate=_with_hints(LocateOptions(), given, None))
+    options = TrackOptions(locate=_with_hints(LocateOptions(), {"time_limit": 10.0, **hints}, None))
     moved = None if motion is None else read_motion(os.fspath(motion))
-    reading = FrameOptions(gsd_m=_hint("gsd", gsd), motion=moved, every_s=every, interval_s=interval)
+    reading = FrameOptions(gsd_m=_hint("gsd", hints.get("gsd")), motion=moved, every_s=every, interval_s=interval)
     paths = [os.fspath(frame) for frame in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
     opened: Any = _open(reference)
     tracked = latest(follow_frames(paths, reading, opened, options, unordered))

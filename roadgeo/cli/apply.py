@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
-import click
-
+from roadgeo._options import OTHERS, option, part, take
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.options import OTHERS, Command, Plugin, each, row, take
+from roadgeo.cli.options import Shared, Verbosity, argument, command
 from roadgeo.cli.printing import echo, tell
-from roadgeo.outputs.registry import offered
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.storage.files import make_folder
 
 __all__ = ["apply_command"]
 
 
-_OPTIONS = (
-    take("out_dir"),
-    row("--stretch", "", OTHERS,
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Apply:
+    """What `roadgeo apply` is asked."""
+
+    location: str = argument("LOCATION.json")
+    pictures: tuple[str, ...] = argument("PICTURE...", many=True)
+    out_dir: str = take(Shared, "out_dir")
+    stretch: bool = option("--stretch", "", OTHERS,
         "The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose "
-        "pixels are not square."),
-    row("--also products", "NAME", OTHERS,
-        "Write a further form, as of `roadgeo locate`: points, gcps, geojson, kmz ... Repeatable.",
-        type=Plugin(offered), multiple=True),
-    take("crs", "resolution", "resampling", "compression", rare=False),
-    take("quiet"),
-)  # fmt: skip
+        "pixels are not square.")
+    products: tuple[str, ...] = take(Shared, "products", group=OTHERS,
+        help="Write a further form, as of `roadgeo locate`: points, gcps, geojson, kmz ... Repeatable.")
+    image: ImageOptions = part(ImageOptions, "crs", "resolution", "resampling", "compression", rare=False)
+    verbosity: Verbosity = part(Verbosity, "quiet")
+# fmt: on
 
 
-@click.command("apply", cls=Command, short_help="Put another picture of a located frame on the map.")
-@click.argument("location", metavar="LOCATION.json", type=click.Path())
-@click.argument("pictures", metavar="PICTURE...", nargs=-1, required=True, type=click.Path())
-@each(_OPTIONS)
-def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, **given: Any) -> int:
+@command("apply", Apply)
+def apply_command(asked: Apply) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
 
     LOCATION.json is written by `roadgeo locate`. A PICTURE is another scan, band, exposure or analysis of the same
@@ -50,17 +51,15 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, **give
     from roadgeo.cli import NOT_LOCATED
     from roadgeo.errors import NotLocatedError
     from roadgeo.outputs.location_document import read_location
-    from roadgeo.outputs.orthophoto import ImageOptions
     from roadgeo.running.applying import apply_location
 
     try:
-        place = read_location(location)
+        place = read_location(asked.location)
     except NotLocatedError as error:
         echo(str(error), err=True)
         return NOT_LOCATED
-    make_folder(out_dir)
-    image = ImageOptions(given["crs"], given["resolution"], given["resampling"], compression=given["compression"])
-    for path in apply_location(place, pictures, out_dir, image, given["products"], given["stretch"]):
+    make_folder(asked.out_dir)
+    for path in apply_location(place, asked.pictures, asked.out_dir, asked.image, asked.products, asked.stretch):
         tell(f"wrote {path}")
-    tell_accuracy([place.to_dict()], given["crs"])
+    tell_accuracy([place.to_dict()], asked.image.crs)
     return 0

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import click
 from click.shell_completion import get_completion_class
 
-from roadgeo.cli.options import Once
+from roadgeo.cli.options import Once, argument, command
 from roadgeo.cli.printing import echo
 
 __all__ = ["completion_command"]
 
 
-@click.command("completion", cls=Once, short_help="Complete commands and options in your shell.")
-@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
-def completion_command(shell: str) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Completion:
+    """What `roadgeo completion` is asked."""
+
+    shell: str = argument("SHELL", type=click.Choice(["bash", "zsh", "fish"]), metavar=None)
+
+
+@command("completion", Completion, Once)
+def completion_command(asked: Completion) -> None:
     """Print what makes a SHELL complete roadgeo's commands and options.
 
     \b
@@ -24,6 +32,6 @@ def completion_command(shell: str) -> None:
     """
     from roadgeo.cli import cli
 
-    kind = get_completion_class(shell)
+    kind = get_completion_class(asked.shell)
     assert kind is not None  # noqa: S101 (the choices above are those that click knows)
     echo(kind(cli, {}, "roadgeo", "_ROADGEO_COMPLETE").source())

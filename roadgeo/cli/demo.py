@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-import click
-
+from roadgeo._options import take
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import Once, take
+from roadgeo.cli.options import Once, Shared, command
 from roadgeo.cli.printing import complain, echo
 from roadgeo.outputs.wording import format_lonlat
 
@@ -20,9 +20,16 @@ if TYPE_CHECKING:
 __all__ = ["demo_command"]
 
 
-@click.command("demo", cls=Once, short_help="Locate a photograph and five masks: needs no network and no data.")
-@take("out_dir", help="Where everything is written; made if missing.", default="roadgeo_demo", show_default=True)
-def demo_command(out_dir: str) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """What `roadgeo demo` is asked."""
+
+    out_dir: str = take(Shared, "out_dir", help="Where everything is written; made if missing.",
+        default="roadgeo_demo", show_default=True)  # fmt: skip
+
+
+@command("demo", Demo, Once)
+def demo_command(asked: Demo) -> int:
     """Show the whole way on real data: build references, locate, write every output, compare with the truth.
 
     The maps are the streets of Berkeley, and a piece of Porto from OpenStreetMap. An aerial photograph is searched for
@@ -56,7 +63,7 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.storage.files import make_folder, write_bytes
 
     # the sources of the demonstration are left beside its results
-    folder, masks, photo = Path(out_dir), demo_masks(), demo_photo()
+    folder, masks, photo = Path(asked.out_dir), demo_masks(), demo_photo()
     make_folder(folder / "masks")
     sources = [(path, path.name) for path in (ROADS, STREETS, PHOTO, photo.path)]
     for source, name in [*sources, *((mask.path, f"masks/{mask.path.name}") for mask in masks)]:
@@ -80,7 +87,7 @@ def demo_command(out_dir: str) -> int:
         search = apply_hints(LocateOptions(), {} if gsd_m is None else {"gsd_m": HINTS["gsd"].read(gsd_m)})
         options = BatchOptions(search, OutputOptions(products=(OVERLAY.name,)))
         tasks = [Task(str(query.path), query.path.stem) for query in queries]
-        for query, outcome in zip(queries, locate_masks(tasks, references, out_dir, options), strict=True):
+        for query, outcome in zip(queries, locate_masks(tasks, references, folder, options), strict=True):
             right, text = _judge(outcome, query)
             wrong += not right
             echo(f"\n{query.path.name}: {query.title}\n  {text}")

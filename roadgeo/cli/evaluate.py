@@ -6,19 +6,20 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
+from roadgeo._options import OTHERS, option, part, take
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import OTHERS, Command, each, hinted, make_options, row, take
+from roadgeo.cli.options import Known, Method, Shared, Verbosity, argument, command, hinted, make_options
 from roadgeo.cli.printing import echo, is_set, tell
 from roadgeo.cli.progress import count_up
-from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
+from roadgeo.cli.queries import Queries, query_sets
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -32,46 +33,35 @@ if TYPE_CHECKING:
 __all__ = ["evaluate_command"]
 
 
-_OPTIONS = (
-    row("--queries", "PATH", OTHERS,
-        "A query set: its folder, or its table.", type=click.Path(exists=True, path_type=Path)),
-    query_options,
-    take("methods"),
-    take("gsd", called="--known-gsd", help="Pixel size as it is told to the search, metres."),
-    take("max_tilt", "north_up", "effort", "time_limit"),
-    row("--radius", "METRES", OTHERS,
-        "Right if nearer.", type=click.FloatRange(0.01), default=20.0, show_default=True, rare=True),
-    take("jobs", help="Processes."),
-    row("--map as_map", "", OTHERS, "Map where such masks (of the first --noise) are located."),
-    row("--height", "METRES", OTHERS,
-        "Above ground, in place of --gsd: height/focal.", type=click.FloatRange(1), rare=True),
-    row("--check", "N", OTHERS,
-        "With --map: try N other masks and count those located in each class.",
-        type=click.IntRange(0), default=0, rare=True),
-    take("out_dir", help="Write here, and go on from here.", default=None),
-    take("json", help="Print the figures as one JSON object."),
-    take("quiet"),
-)  # fmt: skip
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """What `roadgeo evaluate` is asked."""
+
+    reference: str = argument("REF", type=None)
+    queries: Path | None = option("--queries", "PATH", OTHERS, "A query set: its folder, or its table.",
+        type=click.Path(exists=True, path_type=Path))
+    drawn: Queries = part(Queries)
+    how: Method = part(Method)
+    gsd_m: tuple[float, float] | None = take(Known, "gsd_m", names="--known-gsd",
+        help="Pixel size as it is told to the search, metres.")
+    known: Known = part(Known, "max_tilt_deg", "north_up", "effort", "time_limit_s")
+    radius: float = option("--radius", "METRES", OTHERS, "Right if nearer.",
+        limits=(0.01, None), default=20.0, show_default=True, rare=True)
+    jobs: int = take(Shared, "jobs", help="Processes.")
+    as_map: bool = option("--map", "", OTHERS, "Map where such masks (of the first --noise) are located.")
+    height: float | None = option("--height", "METRES", OTHERS, "Above ground, in place of --gsd: height/focal.",
+        limits=(1, None), rare=True)
+    check: int = option("--check", "N", OTHERS,
+        "With --map: try N other masks and count those located in each class.", limits=(0, None), default=0, rare=True)
+    out_dir: str | None = take(Shared, "out_dir", help="Write here, and go on from here.", default=None)
+    as_json: bool = take(Shared, "as_json", help="Print the figures as one JSON object.", group=OTHERS)
+    verbosity: Verbosity = part(Verbosity, "quiet")
+# fmt: on
 
 
-@click.command("evaluate", cls=Command, short_help="Measure how well masks are located.")
-@click.argument("reference", metavar="REF")
-@each(_OPTIONS)
-def evaluate_command(
-    reference: str,
-    queries: Path | None,
-    roads: Path | None,
-    method: Literal["auto", "pair"],
-    paper: bool,
-    pair: tuple[str, ...],
-    radius: float,
-    jobs: int,
-    as_map: bool,
-    height: float | None,
-    check: int,
-    out_dir: str | None,
-    **options: Any,
-) -> None:
+@command("evaluate", Evaluate)
+def evaluate_command(asked: Evaluate) -> None:
     """Locate masks whose place is known, and count.
 
     Without --queries the masks are drawn as `roadgeo simulate` draws them. With --out-dir the folder gets
@@ -95,27 +85,30 @@ def evaluate_command(
     from roadgeo.reference.library import resolve_whole
     from roadgeo.storage.files import make_folder
 
-    _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
-    path, folder = resolve_whole(reference), None if out_dir is None else Path(out_dir)
+    _refuse_idle("--map" if asked.as_map else "" if asked.queries is None else "--queries")
+    path, folder = resolve_whole(asked.reference), None if asked.out_dir is None else Path(asked.out_dir)
     if folder is not None:
         make_folder(folder)
-    if height is not None:
-        options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
+    drawn, known = asked.drawn, replace(asked.known, gsd_m=asked.gsd_m)
+    if asked.height is not None:
+        drawn = replace(drawn, gsd=(asked.height / (drawn.focal or drawn.size),) * 2)
     compile_once()
-    hints = hinted(options)
-    locator = ReferenceLocator((path,), make_options(hints, method, paper=paper, pair=pair))
-    options = {name: value for name, value in options.items() if name not in _HINTED}
-    known = {_HINTED[name]: value for name, value in hints.items() if value != "full"}
-    thresholds = {key: value for key, value in {"paper": paper, "pair": " ".join(pair)}.items() if value}
-    about = {"reference": path.stem, "method": method, **thresholds, **known}
-    if as_map:
-        survey = _survey(locator, options, about)
-        survey = replace(survey, check=check, jobs=jobs, out_dir=folder, counting=count_up)
+    locator = ReferenceLocator((path,), make_options(known, asked.how))
+    told = {_HINTED[name]: value for name, value in hinted(known).items() if value != "full"}
+    thresholds = {"paper": asked.how.paper, "pair": " ".join(asked.how.pair)}
+    about = {
+        "reference": path.stem,
+        "method": asked.how.method,
+        **{key: value for key, value in thresholds.items() if value},
+        **told,
+    }
+    if asked.as_map:
+        survey = _survey(locator, drawn, about)
+        survey = replace(survey, check=asked.check, jobs=asked.jobs, out_dir=folder, counting=count_up)
         _write_map(survey)
         return
-    query_set, settings = _query_set(path, queries, roads, options)
-    settings |= about
-    _evaluate(query_set, locator, settings, radius, jobs, folder)
+    query_set, settings = _query_set(path, asked.queries, drawn)
+    _evaluate(query_set, locator, settings | about, asked.radius, asked.jobs, folder)
 
 
 #: Names of the search's hints in the settings of an evaluation.
@@ -124,25 +117,26 @@ _HINTED = {"gsd_m": "known_gsd", "max_tilt_deg": "max_tilt"} | {
 }
 
 
-def _survey(locator: ReferenceLocator, options: dict[str, Any], about: dict[str, Any]) -> Survey:
+def _survey(locator: ReferenceLocator, drawn: Queries, about: dict[str, Any]) -> Survey:
     """Put together what a map of localizability is made with."""
     from roadgeo.evaluation.survey import ANY, Survey
 
-    trials = options["count"] or 600
-    ((simulation, _), *_) = query_sets(options | {"intersections": ANY})
-    settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
-    settings = _known(settings | {"count": trials, "noise": simulation.kind}) | about
+    trials = drawn.count or 600
+    ((simulation, _), *_) = query_sets(replace(drawn, intersections=ANY))
+    settings = _settings(drawn) | {"count": trials, "noise": simulation.kind} | about
+    settings = {name: value for name, value in settings.items() if name not in ("intersections", "mirrored")}
     return Survey(locator.references[0], simulation, locator, trials, settings=settings)
 
 
-def _known(settings: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if value is not None}
+def _settings(drawn: Queries) -> dict[str, Any]:
+    """Return the settings of an evaluation that the masks to draw are."""
+    return {name: value for name, value in vars(drawn).items() if value is not None and name != "roads"}
 
 
 #: Parameters without an effect beside an option, or without --map.
 _IDLE = {
     "": {"check"},
-    "--queries": {*QUERY_OPTIONS, "check", "height"},
+    "--queries": {*(each.name for each in fields(Queries)), "check", "height"},
     "--map": {"intersections", "mirrored", "queries", "radius", "roads"},
 }
 
@@ -231,16 +225,14 @@ def _recorded(record: Path | None) -> int:
     return max(record.read_text(encoding="utf-8").count("\n") - 1, 0)
 
 
-def _query_set(
-    reference: Path, queries: Path | None, roads: Path | None, options: dict[str, Any]
-) -> tuple[QuerySet, dict[str, Any]]:
+def _query_set(reference: Path, queries: Path | None, drawn: Queries) -> tuple[QuerySet, dict[str, Any]]:
     """Choose between a query set on disk and one to draw, and report it."""
     from roadgeo.evaluation.trials import DrawnMasks, MaskFiles, count_elsewhere
     from roadgeo.evaluation.truth import read_truth
 
     if queries is None:
-        drawn_from = {} if roads is None else {"roads": roads.name}
-        return DrawnMasks(reference, query_sets(options), roads), _known(options) | drawn_from
+        drawn_from = {} if drawn.roads is None else {"roads": drawn.roads.name}
+        return DrawnMasks(reference, query_sets(drawn), drawn.roads), _settings(drawn) | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
     truths = read_truth(table)
     elsewhere = count_elsewhere(truths, reference)

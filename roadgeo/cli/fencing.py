@@ -21,7 +21,7 @@ _REFERENCES, _RESULTS = ("references", "reference", "rebuild"), ("out_dir", "out
 #: Commands that go on from their earlier results: their folder is theirs.
 _GOES_ON = ("evaluate", "simulate")
 #: Parameters that name plugins, and those for which a network is reached.
-_PLUGINS, _REACHING = ("plugin", "segmenters", "products"), ("place", "around", "polygon", "mavlink", "scheduler")
+_PLUGINS, _REACHING = ("plugin", "segmenter", "products"), ("place", "around", "polygon", "mavlink", "scheduler")
 #: Where locks of several processes lie.
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108
 

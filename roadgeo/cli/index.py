@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -10,66 +11,81 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo._options import option, part, take
 from roadgeo._progress import Say
 from roadgeo._text import counted
-from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, installed, row, take
+from roadgeo.cli.options import Engine, Plugin, Shared, Verbosity, command, installed
 from roadgeo.cli.printing import echo, is_set, tell
-from roadgeo.cli.shards import build_in_shards, shard_options, tell_built
+from roadgeo.cli.shards import build_in_shards, read_shards, tell_built
+from roadgeo.geometry.areas import Box
+from roadgeo.matching.hints import read_box, read_place
+from roadgeo.roads.kinds import RoadKind
+from roadgeo.storage.crs import name_crs
 
 if TYPE_CHECKING:
     from roadgeo.sources.roads import Roads
 
 __all__ = ["index_command"]
 
-SOURCE, ROADS, RESULT = "Where the roads come from", "Which roads", "The reference"
+SOURCE, ROADS, RESULT, PIECES = "Where the roads come from", "Which roads", "The reference", "In pieces"
 
 
-_OPTIONS = (
-    row("--osm place", "PLACE", SOURCE, "Fetch the roads of a place from OpenStreetMap."),
-    row("--bbox", "W,S,E,N", SOURCE, "Fetch those in a box, degrees; or cut --roads to it.", type=BOX),
-    row("--around", "LON,LAT,METRES", SOURCE, "Fetch those within a distance of a point.", type=NEAR),
-    row("--polygon", "FILE", SOURCE, "Fetch those inside a polygon of a file.", type=click.Path()),
-    row("--roads", "FILE", SOURCE,
-        "Take roads from a file or a folder of files. Repeatable.", type=click.Path(), multiple=True),
-    row("--source plugin", "NAME:WHERE", SOURCE,
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Index:
+    """What `roadgeo index` is asked."""
+
+    place: str | None = option("--osm", "PLACE", SOURCE, "Fetch the roads of a place from OpenStreetMap.")
+    bbox: Box | None = option("--bbox", "W,S,E,N", SOURCE, "Fetch those in a box, degrees; or cut --roads to it.",
+        read=read_box)
+    around: tuple[float, float, float] | None = option("--around", "LON,LAT,METRES", SOURCE,
+        "Fetch those within a distance of a point.", read=read_place)
+    polygon: str | None = option("--polygon", "FILE", SOURCE, "Fetch those inside a polygon of a file.",
+        type=click.Path())
+    roads: tuple[str, ...] = option("--roads", "FILE", SOURCE,
+        "Take roads from a file or a folder of files. Repeatable.", type=click.Path(), multiple=True, default=())
+    plugin: str | None = option("--source", "NAME:WHERE", SOURCE,
         "Take roads from a plugin; `roadgeo --plugins` lists them.",
-        type=Plugin(partial(installed, "roadgeo.sources"), has_argument=True), rare=True),
-    row("--layer", "NAME", SOURCE,
-        "Layer of --roads, or of the drawing that they were made of, where there are several. Repeatable.",
-        multiple=True),
-    row("--crs", "CRS", SOURCE, "CRS of --roads, where the file does not say, such as EPSG:26986.", type=CRS),
-    row("--kinds", ("main", "drivable", "vehicles", "all"), ROADS,
-        "Which roads: those that the masks show.", default="drivable", show_default=True),
-    row("--tunnels", "", ROADS, "Take tunnels too, which a camera does not see.", rare=True),
-    row("--attribution", "TEXT", ROADS, "Whom to name beside the map, where --roads does not say.", rare=True),
-    row("--date", "YYYY-MM-DD", SOURCE, "Fetch the roads as they were on that day.", rare=True),
-    row("--overpass-url", "URL", SOURCE, "Overpass server to fetch from.", rare=True),
-    row("--nominatim-url", "URL", SOURCE, "Nominatim server that finds --osm places.", rare=True),
-    row("--no-cache", "", SOURCE, "Fetch anew what was fetched before.", rare=True),
-    row("--coarse", "", ROADS,
-        "Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km."),
-    row("--rebuild", "REF", RESULT,
-        "Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example."),
-    row("--name", "NAME", RESULT, "Name of the reference. Default: after the place, else after REF.gpkg or the file."),
-    row("-o --out", "REF.gpkg", RESULT, "Where it goes. Default: into the library, under its name.", type=click.Path()),
-    row("--replace", "", RESULT, "Replace a reference of that name without asking."),
-    shard_options,
-    take("cluster", group="In pieces"),
-    take("verbosity"),
-)  # fmt: skip
+        type=Plugin(partial(installed, "roadgeo.sources"), has_argument=True), rare=True)
+    layer: tuple[str, ...] = option("--layer", "NAME", SOURCE,
+        "Layer of --roads, or of the drawing that they were made of, where there are several. Repeatable.", default=())
+    crs: str | None = option("--crs", "CRS", SOURCE, "CRS of --roads, where the file does not say, such as EPSG:26986.",
+        read=name_crs)
+    kinds: RoadKind = option("--kinds", None, ROADS,
+        "Which roads: those that the masks show.", default="drivable", show_default=True)
+    tunnels: bool = option("--tunnels", "", ROADS, "Take tunnels too, which a camera does not see.", rare=True)
+    attribution: str | None = option("--attribution", "TEXT", ROADS,
+        "Whom to name beside the map, where --roads does not say.", rare=True)
+    date: str | None = option("--date", "YYYY-MM-DD", SOURCE, "Fetch the roads as they were on that day.", rare=True)
+    overpass_url: str | None = option("--overpass-url", "URL", SOURCE, "Overpass server to fetch from.", rare=True)
+    nominatim_url: str | None = option("--nominatim-url", "URL", SOURCE, "Nominatim server that finds --osm places.",
+        rare=True)
+    no_cache: bool = option("--no-cache", "", SOURCE, "Fetch anew what was fetched before.", rare=True)
+    coarse: bool = option("--coarse", "", ROADS,
+        "Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km.")
+    rebuild: str | None = option("--rebuild", "REF", RESULT,
+        "Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example.")
+    name: str | None = option("--name", "NAME", RESULT,
+        "Name of the reference. Default: after the place, else after REF.gpkg or the file.")
+    out: str | None = option("-o --out", "REF.gpkg", RESULT,
+        "Where it goes. Default: into the library, under its name.", type=click.Path())
+    replace: bool = option("--replace", "", RESULT, "Replace a reference of that name without asking.")
+    shards: dict[str, Any] | None = option("--shards", "auto|N|SIZEkm", PIECES,
+        "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
+        read=read_shards)
+    margin: float = option("--margin", "METRES", PIECES,
+        "Ground that neighbours share. Half the diagonal of the largest frame to locate.",
+        limits=(0, 100_000), default=3000.0, show_default=True, rare=True)
+    jobs: int = option("-j --jobs", "N", PIECES,
+        "Processes, each of which builds a piece at a time.", limits=(1, None), default=1, show_default=True)
+    engine: Engine | None = take(Shared, "engine", group=PIECES)
+    scheduler: str | None = take(Shared, "scheduler", group=PIECES)
+    verbosity: Verbosity = part(Verbosity)
+# fmt: on
 
 
-@click.command("index", cls=Command, short_help="Build a reference: the searchable roads of a place.")
-@each(_OPTIONS)
-def index_command(
-    out: str | None,
-    name: str | None,
-    coarse: bool,
-    replace: bool,
-    rebuild: str | None,
-    shards: dict[str, Any] | None,
-    **source: Any,
-) -> None:
+@command("index", Index)
+def index_command(asked: Index) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
 
     Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
@@ -97,44 +113,44 @@ def index_command(
     from roadgeo.workflows import build_reference
 
     started = perf_counter()
-    if rebuild is not None:
-        if replace or coarse or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
+    if asked.rebuild is not None:
+        others = (*_FETCHED, "bbox", "roads", "plugin", "replace", "coarse", "name", "out")
+        if any(getattr(asked, name) for name in others):
             raise click.UsageError("--rebuild takes nothing but the reference: its roads are in its GeoPackage.")
-        _rebuild(rebuild)
+        _rebuild(asked.rebuild)
         return
-    given = _one_source(source)
-    if coarse:
-        source["kinds"] = _kinds_of_coarse(shards is not None)
-    if shards is None:
-        _require_geopackage(out)
-    name = name or _name(source, given, out)
-    if shards is not None:
-        build_in_shards(source, name, out, shards)
+    given = _one_source(asked)
+    if asked.coarse:
+        asked = replace(asked, kinds=_kinds_of_coarse(asked))
+    if asked.shards is None:
+        _require_geopackage(asked.out)
+    name = asked.name or _name(asked, given)
+    if asked.shards is not None:
+        build_in_shards(asked, name)
         return
-    path = Path(out) if out else new_reference(name)
+    path = Path(asked.out) if asked.out else new_reference(name)
     make_folder(path.parent)  # before the long part
-    if not replace:
+    if not asked.replace:
         _keep_or_replace(path)
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     with show_steps() as say:
-        roads = read(source, given, say)
+        roads = read(asked, given, say)
     compile_once(map_only=True)  # nobody waits for that whose roads cannot be read
     with show_steps() as say:
-        reference = build_reference(roads, make_slug(name), COARSE if coarse else None, say=say)
+        reference = build_reference(roads, make_slug(name), COARSE if asked.coarse else None, say=say)
         reference.save(path, say)
     if is_set("verbose"):
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)
-    tell_built(f"{path}: {counted(len(reference.index), 'intersection')}", started, out or path.stem)
+    tell_built(f"{path}: {counted(len(reference.index), 'intersection')}", started, asked.out or path.stem)
 
 
-def _kinds_of_coarse(in_shards: bool) -> str:
+def _kinds_of_coarse(asked: Index) -> RoadKind:
     """Return which roads a coarse map holds: main ones, unless the user named others."""
-    if in_shards:
+    if asked.shards is not None:
         raise click.UsageError("--shards makes a coarse map beside the shards: leave out --coarse.")
-    context = click.get_current_context()
-    named = context.get_parameter_source("kinds") is not click.core.ParameterSource.DEFAULT
-    return str(context.params["kinds"]) if named else "main"
+    source = click.get_current_context().get_parameter_source("kinds")
+    return "main" if source is click.core.ParameterSource.DEFAULT else asked.kinds
 
 
 #: Endings that `--out` must not have.
@@ -190,68 +206,64 @@ def _rebuild(name: str) -> None:
 _FETCHED = {"place": "--osm PLACE", "around": "--around LON,LAT,METRES", "polygon": "--polygon FILE"}
 
 
-def _one_source(source: dict[str, Any]) -> str:
+def _one_source(asked: Index) -> str:
     """Name the option of the source; a box alone is a source, with --roads it cuts them."""
-    given = [option for option in (*_FETCHED, "roads", "plugin") if source[option]]
-    if source["bbox"] and given != ["roads"]:
+    given = [name for name in (*_FETCHED, "roads", "plugin") if getattr(asked, name)]
+    if asked.bbox and given != ["roads"]:
         given.append("bbox")
     if len(given) != 1:
         flags = ", ".join(_FETCHED.values())
         raise click.UsageError(
             f"Give one source of roads: {flags}, --bbox W,S,E,N, --roads FILE or --source NAME:WHERE."
         )
-    if given in (["roads"], ["plugin"]) and (source["date"] or source["no_cache"]):
+    if given in (["roads"], ["plugin"]) and (asked.date or asked.no_cache):
         raise click.UsageError("--date and --no-cache go with roads that are fetched from OpenStreetMap.")
-    if given != ["roads"] and (source["layer"] or source["crs"] or source["attribution"]):
+    if given != ["roads"] and (asked.layer or asked.crs or asked.attribution):
         raise click.UsageError("--layer, --crs and --attribution go with --roads.")
     return given[0]
 
 
-def _read(source: dict[str, Any], given: str, say: Say) -> Roads:
+def _read(asked: Index, given: str, say: Say) -> Roads:
     from roadgeo.sources.roads import read_roads
 
-    which = {name: source[name] for name in ("layer", "crs", "tunnels", "bbox", "attribution")}
-    return read_roads(source[given], which=source["kinds"], **which, say=say)
+    which = {name: getattr(asked, name) for name in ("layer", "crs", "tunnels", "bbox", "attribution")}
+    return read_roads(getattr(asked, given), which=asked.kinds, **which, say=say)
 
 
-def _fetch(source: dict[str, Any], given: str, say: Say) -> Roads:
-    from dataclasses import replace
-
+def _fetch(asked: Index, given: str, say: Say) -> Roads:
     from roadgeo.sources.overpass import FetchOptions
     from roadgeo.sources.roads import fetch_roads
 
-    servers = {key: source[key] for key in ("overpass_url", "nominatim_url") if source[key]}
-    options = replace(FetchOptions(), date=source["date"], cache=not source["no_cache"], **servers)
-    where = {given: source[given], "which": source["kinds"], "tunnels": source["tunnels"]}
+    servers = {key: url for key in ("overpass_url", "nominatim_url") if (url := getattr(asked, key))}
+    options = replace(FetchOptions(), date=asked.date, cache=not asked.no_cache, **servers)
+    where = {given: getattr(asked, given), "which": asked.kinds, "tunnels": asked.tunnels}
     return fetch_roads(**where, options=options, say=say)
 
 
-def _read_plugin(source: dict[str, Any], given: str, say: Say) -> Roads:
-    from dataclasses import replace
-
+def _read_plugin(asked: Index, given: str, say: Say) -> Roads:
     from roadgeo.errors import PluginError
     from roadgeo.plugins import SOURCES, call_plugin
     from roadgeo.sources.roads import Roads
 
-    name, _, where = source[given].partition(":")
+    name, _, where = getattr(asked, given).partition(":")
     roads = call_plugin(SOURCES, name, where, say=say)
     if not isinstance(roads, Roads):
         raise PluginError(
             f"the source {name!r} returned a {type(roads).__name__}, expected roadgeo.sources.roads.Roads"
         )
-    return replace(roads, meta={"sources": [{"name": source[given]}], "attribution": "", **roads.meta})
+    return replace(roads, meta={"sources": [{"name": getattr(asked, given)}], "attribution": "", **roads.meta})
 
 
-def _name(source: dict[str, Any], given: str, out: str | None) -> str:
+def _name(asked: Index, given: str) -> str:
+    value = getattr(asked, given)
     if given == "place":
-        return str(source["place"])
-    if out:
+        return str(value)
+    if asked.out:
         from roadgeo.reference.files import reference_paths
 
-        return reference_paths(out).geopackage.stem.removesuffix(".shards")
+        return reference_paths(asked.out).geopackage.stem.removesuffix(".shards")
     if given == "plugin":
-        return Path(source["plugin"].partition(":")[2]).stem or "roads"
+        return Path(value.partition(":")[2]).stem or "roads"
     if given in {"roads", "polygon"}:
-        first = source["roads"][0] if given == "roads" else source["polygon"]
-        return Path(first).name.split(".")[0]
-    return given + " " + " ".join(f"{number:g}" for number in source[given])
+        return Path(value[0] if given == "roads" else value).name.split(".")[0]
+    return given + " " + " ".join(f"{number:g}" for number in value)

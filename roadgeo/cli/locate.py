@@ -5,39 +5,39 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo._options import IMAGE, RESULTS, SEARCH, option, part, take
 from roadgeo._progress import say_nothing
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.options import (
-    IMAGE,
-    RESULTS,
-    SEARCH,
-    Command,
-    Plugin,
-    Read,
-    each,
+    Engine,
+    Known,
+    Method,
+    Shared,
+    Verbosity,
+    argument,
+    command,
     find_tasks,
     hinted,
     make_cluster,
     make_options,
     open_maps,
-    read_options,
-    row,
-    take,
+    threaded,
 )
 from roadgeo.cli.printing import complain, echo, is_set, paint, tell
 from roadgeo.cli.truths import read_truths
-from roadgeo.matching.hints import HINTS, asked_of_camera, read_taken
+from roadgeo.matching.hints import Taken, asked_of_camera, read_taken
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -47,12 +47,11 @@ from roadgeo.outputs.registry import (
     REGISTRY,
     REPORT,
     Output,
-    offered,
 )
 from roadgeo.outputs.wording import format_lonlat
 from roadgeo.running.batch import locate_masks, write_overview
 from roadgeo.running.locating import Outcome
-from roadgeo.running.options import BatchOptions
+from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.tasks import SUFFIXES
 from roadgeo.storage.files import make_folder
 
@@ -115,125 +114,110 @@ def _more() -> str:
     return _MORE.format(asked=_listed(asked), also=also)
 
 
-_OPTIONS = (
-    take("references", *HINTS),
-    row("--mirror/--no-mirror", "", IMAGE,
-        "The image is mirrored (film scanned from its back), or is not. Default: as its file says.",
-        default=None, rare=True),
-    row("--aspect", "RATIO", IMAGE,
-        "How many times a pixel is as wide as high, of scans that are stretched. Default: as the file says, or 1.",
-        type=click.FloatRange(0.25, 4.0), rare=True),
-    row("--dem", "FILE", IMAGE,
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Locate:
+    """What `roadgeo locate` is asked."""
+
+    masks: tuple[str, ...] = argument("IMAGE...", many=True)
+    references: tuple[str, ...] = take(Shared, "references")
+    known: Known = part(Known)
+    dem: str = option("--dem", "FILE", IMAGE,
         "Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
-        default="", type=click.Path(), rare=True),
-    take("out_dir"),
-    row("--report", "", RESULTS, "Also a page for the browser, located or not."),
-    row("--plot", "", RESULTS, "Also a picture, to look at."),
-    row("--image images", "PHOTO", RESULTS,
+        default="", type=click.Path(), rare=True)
+    out_dir: str = take(Shared, "out_dir")
+    report: bool = option("--report", "", RESULTS, "Also a page for the browser, located or not.")
+    plot: bool = option("--plot", "", RESULTS, "Also a picture, to look at.")
+    images: tuple[str, ...] = option("--image", "PHOTO", RESULTS,
         "Draw this photograph in place of its mask. One per mask, in order, or a folder of them. Repeatable.",
-        type=click.Path(), multiple=True),
-    row("--also products", "NAME", RESULTS,
-        "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
-        type=Plugin(offered), multiple=True),
-    take("json", group=RESULTS),
-    row("--skip-existing/--overwrite", "", RESULTS,
-        "Keep results younger than their images, or make them anew, the default.", default=False, rare=True),
-    row("--explain", "", RESULTS,
-        "How far the search got, the best rejected places, what was missing: a picture and JSON.", rare=True),
-    row("--truth", "LON,LAT|FILE", RESULTS,
+        type=click.Path(), multiple=True, default=())
+    products: tuple[str, ...] = take(Shared, "products")
+    as_json: bool = take(Shared, "as_json")
+    skip_existing: bool = option("--skip-existing/--overwrite", "", RESULTS,
+        "Keep results younger than their images, or make them anew, the default.", rare=True)
+    explain: bool = option("--explain", "", RESULTS,
+        "How far the search got, the best rejected places, what was missing: a picture and JSON.", rare=True)
+    truth: str | None = option("--truth", "LON,LAT|FILE", RESULTS,
         "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
-        rare=True),
-    row("--take taken", "N|LON,LAT", RESULTS,
+        rare=True)
+    taken: Taken | None = option("--take", "N|LON,LAT", RESULTS,
         "Write a place that the last answer for the image lists, as chosen by you: the N-th, or the one nearest to"
-        " LON,LAT. Nothing is searched, unless there is no answer yet.",
-        type=Read("place", read_taken), rare=True),
-    take("crs", "resolution", "resampling", "compression"),
-    row("--max-pixels", "N", RESULTS,
-        "Draw coarser rather than more than this.",
-        type=click.IntRange(1), default=400_000_000, show_default=True, rare=True),
-    take("recursive", "segmenting", "mask_values"),
-    row("--units", ("auto", "pixels", "metres"), IMAGE,
-        "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
-        default="auto", show_default=True, rare=True),
-    row("--layer", "NAME", IMAGE, "Layer of roads that come as lines. Repeatable.", multiple=True, rare=True),
-    row("--page", "N", IMAGE,
-        "Page of a TIFF that holds several. Default: the first.", type=click.IntRange(1), rare=True),
-    take("jobs"),
-    take("methods", "cluster"),
-    row("--divide-map", "", SEARCH,
+        " LON,LAT. Nothing is searched, unless there is no answer yet.", read=read_taken, rare=True)
+    image: ImageOptions = part(ImageOptions)
+    recursive: bool = take(Shared, "recursive")
+    reading: ReadOptions = part(ReadOptions)
+    page: int | None = option("--page", "N", IMAGE,
+        "Page of a TIFF that holds several. Default: the first.", limits=(1, None), rare=True)
+    jobs: int = take(Shared, "jobs")
+    how: Method = part(Method)
+    engine: Engine | None = take(Shared, "engine")
+    scheduler: str | None = take(Shared, "scheduler")
+    divide_map: bool = option("--divide-map", "", SEARCH,
         "On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that no"
-        " machine holds.", rare=True),
-    take("verbosity"),
-)  # fmt: skip
+        " machine holds.", rare=True)
+    verbosity: Verbosity = part(Verbosity)
+# fmt: on
 
 
-@click.command(
+@command(
     "locate",
-    cls=Command,
-    short_help="Find where images lie on a map, and draw them there.",
+    Locate,
     help=_HELP.format(
         always=_listed([output for output in ALWAYS if output.ending.endswith((".json", ".tif", ".gpkg"))])
     ),
     more=_more,
 )
-@click.argument("masks", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@each(_OPTIONS)
-def locate_command(masks: tuple[str, ...], references: tuple[str, ...], out_dir: str, jobs: int, **given: Any) -> int:
+def locate_command(asked: Locate) -> int:
     """Find where images lie on a map, and draw them there; for the help see above."""
     from roadgeo.cli.progress import count_up, show_steps
 
-    hints = hinted(given)
-    options = make_options(hints, given["method"], paper=given["paper"], pair=given["pair"], may_be_stated=True)
-    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
-    outputs = _output_options(given)
-    tasks = find_tasks(masks, given, out_dir)
-    cluster = make_cluster(given, jobs)
-    if given["divide_map"] and (cluster is None or given["method"] == "pair" or given["explain"]):
+    options = make_options(asked.known, asked.how, may_be_stated=True)
+    options = replace(options, truths=read_truths(asked.truth, explain=asked.explain))
+    outputs = _output_options(asked)
+    tasks = find_tasks(asked.masks, asked.recursive, asked.page, asked.out_dir)
+    cluster = make_cluster(asked.engine, asked.scheduler, asked.jobs, asked.divide_map)
+    if asked.divide_map and (cluster is None or asked.how.method == "pair" or asked.explain):
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
     # A mask alone gets threads; on a cluster each worker keeps to one.
-    options = replace(options, threads=jobs if len(tasks) == 1 and cluster is None else 1)
-    make_folder(out_dir)
-    photos = pair_images([task.mask for task in tasks], given["images"])
-    asked = BatchOptions(
+    options = replace(options, threads=asked.jobs if len(tasks) == 1 and cluster is None else 1)
+    make_folder(asked.out_dir)
+    batch = BatchOptions(
         options,
         outputs,
-        read_options(given, jobs),
-        images=photos,
-        exif=asked_of_camera(hints),
-        dem=given["dem"],
-        skip_existing=given["skip_existing"],
-        taken=given["taken"],
+        threaded(asked.reading, asked.jobs),
+        images=pair_images([task.mask for task in tasks], asked.images),
+        exif=asked_of_camera(hinted(asked.known)),
+        dem=asked.dem,
+        skip_existing=asked.skip_existing,
+        taken=asked.taken,
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
-    opened = open_maps(references, options.near)
+    opened = open_maps(asked.references, options.near)
     outcomes: list[Outcome] = []
     is_single = len(tasks) == 1
     steps = show_steps() if is_single else nullcontext(say_nothing)
     with steps as say, count_up(len(tasks), _summarize) as count:
-        for outcome in locate_masks(tasks, references, out_dir, asked, jobs=jobs, cluster=cluster, say=say):
+        for outcome in locate_masks(
+            tasks, asked.references, asked.out_dir, batch, jobs=asked.jobs, cluster=cluster, say=say
+        ):
             outcomes.append(outcome)
             count(outcome.status)
             _report(outcome, is_single)
-    tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
+    tell_accuracy((outcome.document for outcome in outcomes), asked.image.crs)
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
-        files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
+        files = write_overview(asked.out_dir, tasks, outcomes, opened if asked.report else None)
         tell(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     failed = counts["error"] or any(outcome.faults for outcome in outcomes)
     return ERROR if failed else 0 if counts["located"] + counts["chosen"] == len(tasks) else NOT_LOCATED
 
 
-def _output_options(given: Mapping[str, Any]) -> OutputOptions:
+def _output_options(asked: Locate) -> OutputOptions:
     """Put together what is written, and how it is drawn."""
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.outputs.orthophoto import ImageOptions
 
-    switched = [output.name for output in REGISTRY.values() if output.option and given[output.option[2:]]]
-    asked = [*given["products"], *switched]
-    image = ImageOptions(
-        given["crs"], given["resolution"], given["resampling"], given["max_pixels"], given["compression"]
-    )
-    return OutputOptions(image, tuple(dict.fromkeys(asked)))
+    switched = [output.name for output in REGISTRY.values() if output.option and getattr(asked, output.option[2:])]
+    return OutputOptions(asked.image, tuple(dict.fromkeys([*asked.products, *switched])))
 
 
 def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:

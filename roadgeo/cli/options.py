@@ -5,30 +5,28 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import sys
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial, reduce
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, replace
+from functools import partial, wraps
+from types import NoneType, SimpleNamespace, UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import click
 
+from roadgeo._options import IMAGE, OTHERS, RESULTS, SEARCH, WHERE, among, option
 from roadgeo.cli.fencing import OWN_PROCESS, enter_fence
 from roadgeo.cli.printing import echo, keep_switch
-from roadgeo.matching.hints import (
-    HINTS,
-    STATED,
-    Hint,
-    apply_hints,
-    asked_of_camera,
-    read_box,
-    read_gsd,
-    read_place,
-    read_range,
-)
+from roadgeo.geometry.areas import Box
+from roadgeo.matching.hints import HINTS, STATED, Hint, apply_hints, asked_of_camera
+from roadgeo.outputs.registry import offered
 from roadgeo.storage.memory import MEMORY
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from roadgeo.matching.options import LocateOptions
     from roadgeo.reference.opening import AnyReference
     from roadgeo.running.cluster import Cluster
@@ -36,38 +34,34 @@ if TYPE_CHECKING:
     from roadgeo.running.tasks import Task
 
 __all__ = [
-    "BOX",
-    "CRS",
-    "GSD",
-    "IMAGE",
-    "NEAR",
-    "OTHERS",
-    "RANGE",
-    "RESULTS",
-    "SEARCH",
     "Command",
+    "Engine",
+    "Known",
+    "Method",
     "Once",
     "Plugin",
     "Read",
-    "each",
+    "Shared",
+    "Verbosity",
+    "argument",
+    "command",
+    "fill",
     "find_tasks",
+    "hint",
     "hinted",
     "installed",
     "make_cluster",
     "make_options",
     "n_threads",
     "open_maps",
-    "read_options",
-    "row",
-    "take",
+    "refuse_stated",
+    "threaded",
 ]
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+Asked = TypeVar("Asked", bound="DataclassInstance")
+Engine: TypeAlias = Literal["local", "dask"]
 
 _MAX_THREADS = 4
-
-#: Heading of options that stand under no other.
-OTHERS = "Others"
 
 
 # --- help in groups ---------------------------------------------------------------------------------------------------
@@ -215,38 +209,82 @@ def _options_of_the_fence() -> list[click.Parameter]:
     ]  # fmt: skip
 
 
-def row(names: str, shown: str | tuple[str, ...] | None, group: str, text: str, **more: Any) -> Callable[..., Any]:
-    """Make an option from a row of a table. It decorates a command; keywords given with the command replace its own.
+# --- commands ---------------------------------------------------------------------------------------------------------
 
-    Parameters
-    ----------
-    names : str
-        As click has them, with spaces between: "-j --jobs".
-    shown : str, tuple of str or None
-        What stands for its value (None: its type), or the words among which one chooses; "" for a switch.
-    group : str
-        Under which heading of the help it stands.
-    text : str
-        Its help; all behind the first sentence is shown by --help-all only.
-    **more
-        As for `click.option`; `rare`.
+
+def argument(form: str, *, many: bool = False, **settings: Any) -> Any:
+    """Make a field that is an argument of a command, or with `many` all of them; `settings` as for `click.Argument`."""
+    usual = {"metavar": form, "type": click.Path(), **({"nargs": -1, "required": True} if many else {})}
+    return field(metadata={"argument": {**usual, **settings}})
+
+
+def command(
+    name: str, kind: type[Asked], cls: type[click.Command] = Command, group: click.Group | None = None, **settings: Any
+) -> Callable[[Callable[[Asked], Any]], click.Command]:
+    """Make a command of a function that takes what was asked: a dataclass of arguments and options.
+
+    The function's docstring is its help, unless `settings`, which are as for the class of the command, give another.
     """
-    kind: dict[str, Any] = {"type": click.Choice(shown)} if isinstance(shown, tuple) else {"metavar": shown}
-    settings = {**({"is_flag": True} if shown == "" else kind), "group": group, "help": text, **more}
 
-    def add(command: Decorated, **own: Any) -> Decorated:
-        return click.option(*names.split(), cls=_Option, **(settings | own))(command)
+    def make(run: Callable[[Asked], Any]) -> click.Command:
+        @wraps(run)
+        def call(**given: Any) -> Any:
+            return run(fill(kind, given))
 
-    return add
+        taken = [(each.name, each.metadata.get("argument")) for each in fields(kind)]
+        arguments = [click.Argument([name], **form) for name, form in taken if form is not None]
+        options = [_click_option(*each) for each in among(kind)]
+        made = cls(name, params=[*arguments, *options], callback=call, **{"help": inspect.getdoc(run), **settings})
+        if group is not None:
+            group.add_command(made)
+        return made
+
+    return make
 
 
-def each(decorators: Iterable[Callable[[Decorated], Decorated]]) -> Callable[[Decorated], Decorated]:
-    """Put options upon a command, in their order."""
+def fill(kind: type[Asked], given: Mapping[str, Any]) -> Asked:
+    """Return what was asked, an object of a class of options, of the values of click's parameters."""
+    values = {}
+    for each in fields(kind):
+        if "part" in each.metadata:
+            of, names, _ = each.metadata["part"]
+            values[each.name] = fill(of, {name: given[name] for name in names or given})
+        elif each.name in given:
+            values[each.name] = given[each.name]
+    return kind(**values)
 
-    def add(command: Decorated) -> Decorated:
-        return reduce(lambda decorated, add: add(decorated), reversed([*decorators]), command)
 
-    return add
+def _click_option(home: type, of: Field[Any], said: Mapping[str, Any]) -> click.Option:
+    """Make click's option of a field of a class (see `_options.option`)."""
+    more = dict(said)
+    names, form, read, plugins, ending, limits, above = (
+        more.pop(name, None) for name in ("names", "form", "read", "plugins", "ending", "limits", "above")
+    )
+    if read is not None:
+        kind: dict[str, Any] = {"type": Read(of.name, read)}
+    elif plugins:
+        kind = {"type": Plugin(partial(installed, plugins), file_ending=ending or "")}
+    else:
+        kind = {} if "type" in more else _kind_of(home, of, limits, above)
+    return _Option([*names.split(), of.name], **{"default": of.default, "metavar": form, **kind, **more})
+
+
+def _kind_of(home: type, of: Field[Any], limits: tuple[Any, Any] | None, above: bool | None) -> dict[str, Any]:
+    """Return how click reads a value, by the type of its field: as a switch, words, numbers or texts."""
+    named = SimpleNamespace(__annotations__={"of": of.type})
+    kind = get_type_hints(named, vars(sys.modules[home.__module__]))["of"]
+    if get_origin(kind) in (Union, UnionType):
+        (kind,) = (each for each in get_args(kind) if each is not NoneType)
+    more: dict[str, Any] = {}
+    if get_origin(kind) is tuple:
+        kind, more = get_args(kind)[0], {"multiple": True}
+    if kind is bool:
+        return {"is_flag": True, "metavar": None}
+    if get_origin(kind) is Literal:
+        return {"type": click.Choice(get_args(kind)), "metavar": None, **more}
+    if limits is not None:
+        kind = click.IntRange(*limits) if kind is int else click.FloatRange(*limits, min_open=bool(above))
+    return {"type": kind, **more}
 
 
 # --- types ------------------------------------------------------------------------------------------------------------
@@ -308,7 +346,7 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
             return text
         name, colon, _ = text.partition(":")
         installed = self.names()
-        if name not in installed or bool(colon) != self.has_argument:
+        if text and (name not in installed or bool(colon) != self.has_argument):
             expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in installed)
             self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
         return text
@@ -327,144 +365,92 @@ def installed(group: str) -> list[str]:
     return sorted(find_plugins(group))
 
 
-def _read_bands(text: str) -> tuple[int, ...]:
-    numbers = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
-    if len(numbers) != 3 or min(numbers) < 1:
-        raise ValueError(f"got {text!r}, expected R,G,B: three numbers from 1")
-    return tuple(numbers)
-
-
-def _read_crs(text: str) -> str:
-    from roadgeo.storage.crs import name_crs
-
-    return name_crs(text)
-
-
-#: Two numbers, least and greatest; a pixel size; a place and a radius; a box in degrees.
-RANGE, GSD, NEAR, BOX = (
-    Read("range", read_range),
-    Read("gsd", read_gsd),
-    Read("near", read_place),
-    Read("box", read_box),
-)
-CRS = Read("CRS", _read_crs)
-
-
 # --- options that commands share --------------------------------------------------------------------------------------
 
-RESULTS = "The results"
-WHERE, IMAGE, SEARCH = HINTS["near"].group, HINTS["gsd"].group, HINTS["effort"].group
+
+def hint(name: str, **changes: Any) -> Any:
+    """Make a field of a hint; `changes` replace what the table says of it, or its default."""
+    of = HINTS[name]
+    more = {"default": None, "read": None if name in ("effort", "north_up") else of.read, "hint": of}
+    return option(changes.pop("names", of.option), of.form, of.group, changes.pop("help", of.told), **more, **changes)
 
 
-def _hint_option(name: str, command: Decorated, **own: Any) -> Decorated:
-    """Add the option of a hint."""
-    hint = HINTS[name]
-    shown = tuple(hint.form.split("|")) if name == "effort" else hint.form
-    names = [own.pop("called", hint.option), hint.goes_to]
-    kind = {"default": None} if shown == "" else {} if name == "effort" else {"type": Read(name, hint.read)}
-    decorated: Decorated = row(" ".join(names), shown, hint.group, hint.told, hint=hint, **kind)(command, **own)
-    return decorated
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of an image: all hints, by the names of `Hint.goes_to`."""
+
+    near: tuple[float, float, float] | Literal["exif"] | None = hint("near")
+    within: Box | None = hint("within")
+    gsd_m: tuple[float, float] | Literal["exif"] | None = hint("gsd")
+    heading_deg: tuple[float, float] | Literal["exif"] | None = hint("heading")
+    north_up: bool | None = hint("north_up")
+    max_tilt_deg: float | None = hint("max_tilt")
+    focal_px: float | Literal["exif"] | None = hint("focal")
+    effort: Literal["quick", "full"] | None = hint("effort")
+    time_limit_s: float | None = hint("time_limit")
 
 
-_SEGMENT = "Which images are photographs, whose roads are found first: those that look so, all, or none. Default: auto."
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """Which matcher searches."""
 
-#: Switches that are for whoever prints, not for the command.
-_KEPT: dict[str, Any] = {"expose_value": False, "callback": keep_switch}
-
-#: Options of several commands by the names that `take` takes; rows as of `row`.
-_SHARED = {
-    "references": row("-r --reference references", "REF", WHERE,
-        "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-        type=click.Path(), multiple=True),
-    "out_dir": row("-o --out-dir", "DIR", RESULTS,
-        "Folder for the results; made if missing. Default: here.",
-        type=click.Path(file_okay=False), default="."),
-    "json": row("--json as_json", "", OTHERS, "Print one JSON object per image and line.", **_KEPT),
-    "crs": row("--crs", "CRS", RESULTS, "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.", type=CRS),
-    "resolution": row("--resolution", "SIZE", RESULTS,
-        "Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
-        type=click.FloatRange(min=0, min_open=True), rare=True),
-    "resampling": row("--resampling", ("nearest", "bilinear", "cubic", "lanczos"), RESULTS,
-        "How values between pixels are found; nearest for classes.", default="cubic", show_default=True, rare=True),
-    "compression": row("--compression", ("deflate", "zstd", "jpeg", "webp"), RESULTS,
-        "Compression of rasters. jpeg and webp, for photographs only, make them five times smaller, with some loss.",
-        default="deflate", show_default=True, rare=True),
-    "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
-    "segmenter": row("--segmenter", "NAME|MODEL.onnx", IMAGE,
-        "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness or "
-        "STAC describe them. Default: the model that ships.",
-        type=Plugin(partial(installed, "roadgeo.segmenters"), file_ending=".onnx"), rare=True),
-    "class_name": row("--class class_name", "NAME|N", IMAGE,
-        "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True),
-    "threshold": row("--threshold", "T", IMAGE,
-        "Values above T are road; of photographs, probabilities. Default: by the values.", type=float, rare=True),
-    "band": row("--band", "N", IMAGE,
-        "Band that holds the mask. Default: by the bands.", type=click.IntRange(1), rare=True),
-    "bands": row("--bands", "R,G,B", IMAGE,
-        "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
-        type=Read("bands", _read_bands), rare=True),
-    "recursive": row("--recursive", "", IMAGE, "Also take the images of folders within folders."),
-    "jobs": row("-j --jobs", "N", SEARCH,
-        "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
-        "Default: 1.", type=click.IntRange(1), default=1, show_default=False),
-    "method": row("--method", ("auto", "pair"), SEARCH,
+    method: Literal["auto", "pair"] = option("--method", None, SEARCH,
         "auto: the best there is, the default. pair: the matcher of the paper that roadgeo began with, for comparison.",
-        default="auto", rare=True),
-    "paper": row("--paper", "", SEARCH,
+        default="auto", rare=True)
+    paper: bool = option("--paper", "", SEARCH,
         "With --method pair: the paper to the letter. Without it matches are one to one, cameras are real, and places"
-        " are refined.", rare=True),
-    "pair": row("--pair", "NAME=VALUE", SEARCH,
+        " are refined.", rare=True)
+    pair: tuple[str, ...] = option("--pair", "NAME=VALUE", SEARCH,
         "With --method pair: one of its thresholds, by the paper's symbols, such as delta=0.2 or d_max_m=1500."
-        " Repeatable.", multiple=True, rare=True),
-    "engine": row("--engine", ("local", "dask"), SEARCH,
+        " Repeatable.", default=(), rare=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verbosity:
+    """Switches for whoever prints (see `printing.is_set`)."""
+
+    quiet: bool = option("-q --quiet", "", OTHERS, "Say nothing but errors, and what --json prints.",
+        callback=keep_switch)
+    verbose: bool = option("-v --verbose", "", OTHERS, "Say more: numbers, times, files read.", callback=keep_switch)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shared:
+    """Options that several commands take."""
+
+    references: tuple[str, ...] = option("-r --reference", "REF", WHERE,
+        "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+        type=click.Path(), multiple=True, default=())
+    out_dir: str = option("-o --out-dir", "DIR", RESULTS, "Folder for the results; made if missing. Default: here.",
+        type=click.Path(file_okay=False), default=".")
+    as_json: bool = option("--json", "", RESULTS, "Print one JSON object per image and line.", callback=keep_switch)
+    recursive: bool = option("--recursive", "", IMAGE, "Also take the images of folders within folders.")
+    products: tuple[str, ...] = option("--also", "NAME", RESULTS,
+        "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
+        type=Plugin(offered), multiple=True, default=())
+    jobs: int = option("-j --jobs", "N", SEARCH,
+        "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
+        "Default: 1.", limits=(1, None), default=1, show_default=False)
+    engine: Engine | None = option("--engine", None, SEARCH,
         "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers, which "
-        "survives their death. Needs dask and distributed.", rare=True),
-    "scheduler": row("--scheduler", "ADDRESS", SEARCH,
-        "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.", rare=True),
-    "mavlink": row("--mavlink", "URL", OTHERS, "Also send places to an autopilot, to such as udpout:127.0.0.1:14550."),
-    "quiet": row("-q --quiet", "", OTHERS, "Say nothing but errors, and what --json prints.", **_KEPT),
-    "verbose": row("-v --verbose", "", OTHERS, "Say more: numbers, times, files read.", **_KEPT),
-}  # fmt: skip
-
-#: Several that go together.
-_TOGETHER = {
-    "segmenting": ("segment", "segmenter", "class_name"),
-    "mask_values": ("threshold", "band", "bands"),
-    "cluster": ("engine", "scheduler"),
-    "methods": ("method", "paper", "pair"),
-    "verbosity": ("quiet", "verbose"),
-}
-
-
-def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
-    """Add options of the tables by their names; `settings` replace the tables' settings of a single one."""
-
-    def add_all(command: Decorated) -> Decorated:
-        for name in reversed([option for given in names for option in _TOGETHER.get(given, (given,))]):
-            add = partial(_hint_option, name) if name in HINTS else _SHARED[name]
-            command = add(command, **settings)
-        return command
-
-    return add_all
+        "survives their death. Needs dask and distributed.", rare=True)
+    scheduler: str | None = option("--scheduler", "ADDRESS", SEARCH,
+        "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.", rare=True)
+    mavlink: str | None = option("--mavlink", "URL", OTHERS,
+        "Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
+# fmt: on
 
 
 # --- what the options come to -----------------------------------------------------------------------------------------
 
 
-def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hints on the image, out of all parameters; a switch that was not set is left out."""
-    names = (hint.goes_to for hint in HINTS.values())
-    return {name: given[name] for name in names if given.get(name) is not None and given[name] is not False}
+def hinted(given: Known) -> dict[str, Any]:
+    """Return the hints that are given, by their names; a switch that was not set is left out."""
+    return {name: value for name, value in vars(given).items() if value is not None and value is not False}
 
 
-def make_options(
-    hints: Mapping[str, Any],
-    method: Any = "auto",
-    *,
-    paper: bool = False,
-    pair: Sequence[str] = (),
-    may_be_stated: bool = False,
-) -> LocateOptions:
+def make_options(hints: Known, how: Method | None = None, *, may_be_stated: bool = False) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is.
 
     Raises
@@ -473,24 +459,23 @@ def make_options(
         The paper's method knows no hints; only that method has its thresholds. What the camera states is for single
         images.
     """
-    from dataclasses import replace
-
     from roadgeo.matching.paper import PAPER, PairOptions, read_options
     from roadgeo.workflows import LocateOptions
 
+    how, given = how or Method(), hinted(hints)
     if not may_be_stated:
-        refuse_stated(hints)
-    if method == "pair":
-        idle = [hint for hint in HINTS.values() if hint.group != SEARCH and hints.get(hint.goes_to, False) is not False]
+        refuse_stated(given)
+    if how.method == "pair":
+        idle = [hint for hint in HINTS.values() if hint.group != SEARCH and hint.goes_to in given]
         if idle:
             raise click.UsageError(f"--method pair takes no {', '.join(hint.option for hint in idle)}: leave it out.")
-    elif paper or pair:
+    elif how.paper or how.pair:
         raise click.UsageError("--paper and --pair go with --method pair.")
     try:
-        thresholds = read_options(pair, PAPER if paper else PairOptions())
+        thresholds = read_options(how.pair, PAPER if how.paper else PairOptions())
     except ValueError as error:
         raise click.UsageError(f"--pair {error}.") from error
-    return apply_hints(replace(LocateOptions(), method=method, pair=thresholds), hints)
+    return apply_hints(replace(LocateOptions(), method=how.method, pair=thresholds), given)
 
 
 def refuse_stated(hints: Mapping[str, Any]) -> None:
@@ -507,7 +492,9 @@ def refuse_stated(hints: Mapping[str, Any]) -> None:
         raise click.UsageError(f"{option} {STATED} is for `locate`: give the value here, or leave it out.")
 
 
-def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | None = None) -> list[Task]:
+def find_tasks(
+    images: Sequence[str], recursive: bool, page: int | None = None, out_dir: str | None = None
+) -> list[Task]:
     """Return a task for each image that is named.
 
     Raises
@@ -518,7 +505,7 @@ def find_tasks(images: Sequence[str], given: Mapping[str, Any], out_dir: str | N
     from roadgeo.running.tasks import find_masks, name_tasks
     from roadgeo.storage.rasters import name_page
 
-    paths = [name_page(name, given.get("page")) for name in find_masks(images, given["recursive"])]
+    paths = [name_page(name, page) for name in find_masks(images, recursive)]
     if not paths:
         raise click.UsageError(f"No images in {', '.join(images)}.")
     return name_tasks(paths, out_dir)
@@ -552,17 +539,12 @@ def n_threads(jobs: int = 1) -> int:
     return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
 
 
-def read_options(given: Mapping[str, Any], jobs: int = 1) -> ReadOptions:
-    """Put together how what is given is read."""
-    from dataclasses import fields
-
-    from roadgeo.running.options import ReadOptions
-
-    stated = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) not in (None, ())}
-    return ReadOptions(**{**stated, "threads": n_threads(jobs)})
+def threaded(reading: ReadOptions, jobs: int = 1) -> ReadOptions:
+    """Return how images are read, with the threads that a model gets."""
+    return replace(reading, threads=n_threads(jobs))
 
 
-def make_cluster(given: Mapping[str, Any], jobs: int) -> Cluster | None:
+def make_cluster(engine: str | None, scheduler: str | None, jobs: int, divide_map: bool = False) -> Cluster | None:
     """Return the cluster that was asked for, None for processes of this machine.
 
     Raises
@@ -570,10 +552,10 @@ def make_cluster(given: Mapping[str, Any], jobs: int) -> Cluster | None:
     click.UsageError
         A scheduler and another engine.
     """
-    if given["scheduler"] is None and given["engine"] != "dask":
+    if scheduler is None and engine != "dask":
         return None
-    if given["engine"] == "local":
+    if engine == "local":
         raise click.UsageError("--scheduler goes with --engine dask.")
     from roadgeo.running.cluster import Cluster
 
-    return Cluster(given["scheduler"], jobs, bool(given.get("divide_map")))
+    return Cluster(scheduler, jobs, divide_map)

@@ -25,11 +25,12 @@ def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
     click.echo(visible(text, lines=True).replace(_MARK, "\x1b"), err=err, color=color)
 
 
-def keep_switch(context: click.Context, parameter: click.Parameter, given: bool) -> None:
+def keep_switch(context: click.Context, parameter: click.Parameter, given: bool) -> bool:
     """Keep a switch of the command that runs for all that prints, as click calls back; --quiet for the log, too."""
     context.meta[f"roadgeo.{parameter.name}"] = given
     if given and parameter.name == "quiet":
         _LOG.setLevel(logging.ERROR)
+    return given
 
 
 @contextmanager

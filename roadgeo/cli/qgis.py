@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 import click
 
+from roadgeo._options import OTHERS, option
 from roadgeo.cli import Group
-from roadgeo.cli.options import OTHERS, Once, row
+from roadgeo.cli.options import Once, command
 from roadgeo.cli.printing import echo
 
 __all__ = ["qgis_command"]
@@ -25,11 +27,32 @@ def qgis_command() -> None:
     """
 
 
-@qgis_command.command("install", cls=Once, short_help="Put the plugin into a QGIS profile.")
-@row("--profile", "PROFILE", OTHERS,
-     "A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
-     default="default", show_default=True)  # fmt: skip
-def install_command(profile: str) -> None:
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Install:
+    """What `roadgeo qgis install` is asked."""
+
+    profile: str = option("--profile", "PROFILE", OTHERS,
+        "A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
+        default="default", show_default=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Package:
+    """What `roadgeo qgis package` is asked."""
+
+    out: str | None = option("-o --out", "FILE", OTHERS, "The package. Default: roadgeo_qgis-VERSION.zip.",
+        type=click.Path(dir_okay=False))
+    email: str | None = option("--email", "ADDRESS", OTHERS,
+        "The publisher's. Default, here and below: as the package says.")
+    repository: str | None = option("--repository", "URL", OTHERS, "Where the source code is.")
+    tracker: str | None = option("--tracker", "URL", OTHERS, "Where to report problems.")
+    homepage: str | None = option("--homepage", "URL", OTHERS, "Where the documentation is.")
+# fmt: on
+
+
+@command("install", Install, Once, group=qgis_command, short_help="Put the plugin into a QGIS profile.")
+def install_command(asked: Install) -> None:
     """Put the plugin into a QGIS profile, in place of an earlier version, and enable it there.
 
     It calls the roadgeo that installed it; another one is set in QGIS, by Plugins > roadgeo > Set up roadgeo.
@@ -41,20 +64,15 @@ def install_command(profile: str) -> None:
     """
     from roadgeo.qgis.installation import find_profiles, install_plugin
 
-    for folder in find_profiles(profile):
+    for folder in find_profiles(asked.profile):
         echo(f"installed {install_plugin(folder)}")
     if "VIRTUAL_ENV" in os.environ:
         echo("Leave the environment first (deactivate): QGIS would take its Python for its own.", err=True)
     echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
 
 
-@qgis_command.command("package", cls=Once, short_help="Make the plugin's package.")
-@row("-o --out", "FILE", OTHERS, "The package. Default: roadgeo_qgis-VERSION.zip.", type=click.Path(dir_okay=False))
-@row("--email", "ADDRESS", OTHERS, "The publisher's. Default, here and below: as the package says.")
-@row("--repository", "URL", OTHERS, "Where the source code is.")
-@row("--tracker", "URL", OTHERS, "Where to report problems.")
-@row("--homepage", "URL", OTHERS, "Where the documentation is.")
-def package_command(out: str | None, **publisher: str | None) -> None:
+@command("package", Package, Once, group=qgis_command, short_help="Make the plugin's package.")
+def package_command(asked: Package) -> None:
     """Make the package that QGIS installs (Plugins > Manage and Install Plugins > Install from ZIP).
 
     QGIS's plugin repository (plugins.qgis.org) takes the same package. It asks for the publisher's address, for the
@@ -68,6 +86,6 @@ def package_command(out: str | None, **publisher: str | None) -> None:
     from roadgeo._version import __version__
     from roadgeo.qgis.installation import NAME, write_package
 
-    path = out or f"{NAME}-{__version__}.zip"
-    write_package(path, {key: value for key, value in publisher.items() if value})
+    path = asked.out or f"{NAME}-{__version__}.zip"
+    write_package(path, {key: value for key, value in vars(asked).items() if value and key != "out"})
     echo(f"wrote {path}")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 import click
 
-from roadgeo.cli.options import GSD, OTHERS, RANGE, Read, each, row
-from roadgeo.matching.hints import read_numbers
+from roadgeo._options import OTHERS, option
+from roadgeo.matching.hints import read_gsd, read_numbers, read_range
 
 if TYPE_CHECKING:
     from roadgeo.evaluation.simulation import SimulationOptions
 
-__all__ = ["QUERY_OPTIONS", "query_options", "query_sets"]
+__all__ = ["Queries", "query_sets"]
 
 
 def _read_angles(text: str) -> tuple[float, float]:
@@ -24,69 +24,61 @@ def _read_angles(text: str) -> tuple[float, float]:
     return low, high
 
 
-#: Degrees, least and greatest.
-ANGLES = Read("angles", _read_angles)
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Queries:
+    """Which masks are drawn."""
 
-#: Adds the options that `query_sets` takes.
-query_options = each((
-    row("-n --count", "N", OTHERS, "Masks per noise model.  [default: 40]", type=click.IntRange(1)),
-    row("--noise", ("clean", "segmented", "poor"), OTHERS,
+    count: int | None = option("-n --count", "N", OTHERS, "Masks per noise model.  [default: 40]", limits=(1, None))
+    noise: tuple[Literal["clean", "segmented", "poor"], ...] = option("--noise", None, OTHERS,
         "What goes wrong in the masks; repeat it for several.",
-        multiple=True, default=["clean", "segmented", "poor"], show_default=True),
-    row("--roads", "FILE", OTHERS,
+        default=("clean", "segmented", "poor"), show_default=True)
+    roads: Path | None = option("--roads", "FILE", OTHERS,
         "Draw the roads of this file, another map of the place, in place of the reference's own.",
-        type=click.Path(exists=True, path_type=Path)),
-    row("--gsd", "SIZE|LO:HI", OTHERS,
-        "Metres per pixel at the centre.", type=GSD, default="0.7:1.4", show_default=True),
-    row("--tilt", "LO:HI", OTHERS,
-        "Angle of the optical axis from the vertical, degrees.", type=ANGLES, default="0:30", show_default=True),
-    row("--heading", "LO:HI", OTHERS,
-        "Where the image's up points, degrees from north.", type=ANGLES, default="0:360", show_default=True),
-    row("--size", "PX", OTHERS,
-        "Side of a mask, pixels.", type=click.IntRange(64, 20_000), default=1500, show_default=True),
-    row("--window", "METRES", OTHERS, "Side on the ground, in place of --size.", type=click.FloatRange(10), rare=True),
-    row("--focal", "PX", OTHERS, "Focal length in pixels.  [default: the side]", type=click.FloatRange(1)),
-    row("--intersections", "LO:HI", OTHERS,
-        "How many a mask must show.", type=RANGE, default="30:1000000", show_default=True, rare=True),
-    row("--road-width", "LO:HI", OTHERS,
-        "Width of a street, metres.", type=RANGE, default="8:11", show_default=True, rare=True),
-    row("--mirrored", "N", OTHERS,
+        type=click.Path(exists=True, path_type=Path))
+    gsd: tuple[float, float] = option("--gsd", "SIZE|LO:HI", OTHERS,
+        "Metres per pixel at the centre.", read=read_gsd, default="0.7:1.4", show_default=True)
+    tilt: tuple[float, float] = option("--tilt", "LO:HI", OTHERS,
+        "Angle of the optical axis from the vertical, degrees.", read=_read_angles, default="0:30", show_default=True)
+    heading: tuple[float, float] = option("--heading", "LO:HI", OTHERS,
+        "Where the image's up points, degrees from north.", read=_read_angles, default="0:360", show_default=True)
+    size: int = option("--size", "PX", OTHERS,
+        "Side of a mask, pixels.", limits=(64, 20_000), default=1500, show_default=True)
+    window: float | None = option("--window", "METRES", OTHERS, "Side on the ground, in place of --size.",
+        limits=(10, None), rare=True)
+    focal: float | None = option("--focal", "PX", OTHERS, "Focal length in pixels.  [default: the side]",
+        limits=(1, None))
+    intersections: tuple[float, float] = option("--intersections", "LO:HI", OTHERS,
+        "How many a mask must show.", read=read_range, default="30:1000000", show_default=True, rare=True)
+    road_width: tuple[float, float] = option("--road-width", "LO:HI", OTHERS,
+        "Width of a street, metres.", read=read_range, default="8:11", show_default=True, rare=True)
+    mirrored: int = option("--mirrored", "N", OTHERS,
         "Draw so many masks turned over besides, which have no place and must be refused.",
-        type=click.IntRange(0), default=0, rare=True),
-    row("--seed", "N", OTHERS,
-        "Other seeds draw other masks.", type=click.IntRange(0), default=0, show_default=True, rare=True),
-))  # fmt: skip
+        limits=(0, None), default=0, rare=True)
+    seed: int = option("--seed", "N", OTHERS,
+        "Other seeds draw other masks.", limits=(0, None), default=0, show_default=True, rare=True)
+# fmt: on
 
 
-#: Names of the parameters of `query_sets`, and of `--roads`.
-QUERY_OPTIONS = {
-    *("count", "noise", "roads", "gsd", "tilt", "heading", "size", "window", "focal"),
-    *("intersections", "road_width", "mirrored", "seed"),
-}
-
-
-#: Options of `ViewOptions` by their names there.
-_VIEW = {
-    "window_m": "window",
-    "gsd_m": "gsd",
-    "tilt_deg": "tilt",
-    "heading_deg": "heading",
-    "focal_px": "focal",
-    "road_width_m": "road_width",
-}
-
-
-def query_sets(options: Mapping[str, Any]) -> tuple[tuple[SimulationOptions, int], ...]:
+def query_sets(asked: Queries) -> tuple[tuple[SimulationOptions, int], ...]:
     """Turn the options into sets of queries, one per noise model, and one of mirrored masks where some are wanted."""
     from roadgeo.evaluation.noise import NOISE_MODELS
     from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 
-    fewest, most = options["intersections"]
-    given: dict[str, Any] = {field: options[name] for field, name in _VIEW.items()}
-    view = ViewOptions((options["size"],) * 2, intersections=(int(fewest), int(most)), **given)
-    noise, seed, count = options["noise"], options["seed"], options["count"] or 40
-    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count) for name in dict.fromkeys(noise)]
-    if options["mirrored"]:
-        turned = SimulationOptions(view, NOISE_MODELS[noise[0]], "mirrored", seed, mirrored=True)
-        sets.append((turned, options["mirrored"]))
+    fewest, most = asked.intersections
+    view = ViewOptions(
+        (asked.size, asked.size),
+        asked.window,
+        asked.gsd,
+        asked.tilt,
+        asked.heading,
+        asked.focal,
+        (int(fewest), int(most)),
+        asked.road_width,
+    )
+    kinds = dict.fromkeys(asked.noise)
+    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, asked.seed), asked.count or 40) for name in kinds]
+    if asked.mirrored:
+        noise = NOISE_MODELS[asked.noise[0]]
+        sets.append((SimulationOptions(view, noise, "mirrored", asked.seed, mirrored=True), asked.mirrored))
     return tuple(sets)

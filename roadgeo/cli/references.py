@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import click
 
+from roadgeo._options import OTHERS, option, take
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, Group
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import OTHERS, Command, Once, row, take
+from roadgeo.cli.options import Once, Shared, argument, command
 from roadgeo.cli.printing import complain, echo, is_set
 
 __all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
@@ -33,11 +35,17 @@ def reference_command() -> None:
     """
 
 
-@reference_command.command("info", cls=Command, short_help="Describe a reference.")
-@click.argument("reference", metavar="REF", type=click.Path(), required=False)
-@row("--plugins", "", OTHERS, "The same as `roadgeo --plugins`.", hidden=True)
-@take("json", help="Print everything that is known as one JSON object.")
-def info_command(reference: str | None, plugins: bool) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Info:
+    """What `roadgeo reference info` is asked."""
+
+    reference: str | None = argument("REF", required=False)
+    plugins: bool = option("--plugins", "", OTHERS, "The same as `roadgeo --plugins`.", hidden=True)
+    as_json: bool = take(Shared, "as_json", help="Print everything that is known as one JSON object.", group=OTHERS)
+
+
+@command("info", Info, group=reference_command, short_help="Describe a reference.")
+def info_command(asked: Info) -> None:
     """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
 
     Reads a few kilobytes, whatever the size of the reference, and runs nothing that a file may carry.
@@ -47,15 +55,15 @@ def info_command(reference: str | None, plugins: bool) -> None:
       roadgeo reference info boston-ma
       roadgeo reference info maps/porto.gpkg --json
     """
-    if plugins:
+    if asked.plugins:
         list_plugins()
         return
-    if reference is None:
+    if asked.reference is None:
         raise click.UsageError("Missing argument 'REF'.")
     from roadgeo.reference.inspection import describe_reference
     from roadgeo.reference.library import resolve_reference
 
-    described = describe_reference(resolve_reference(reference))
+    described = describe_reference(resolve_reference(asked.reference))
     if is_set("as_json"):
         echo(json.dumps({"schema": SCHEMA, **made_by(), **described}, indent=2))
         return
@@ -81,9 +89,15 @@ def list_plugins() -> None:
         echo("  ".join([*(text.ljust(width) for text, width in zip(line, widths, strict=False)), line[3]]))
 
 
-@reference_command.command("check", cls=Command, short_help="Test whether the files of references are sound.")
-@click.argument("references", metavar="REF...", nargs=-1, required=True, type=click.Path())
-def check_command(references: tuple[str, ...]) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What `roadgeo reference check` is asked."""
+
+    references: tuple[str, ...] = argument("REF...", many=True)
+
+
+@command("check", Check, group=reference_command, short_help="Test whether the files of references are sound.")
+def check_command(asked: Check) -> int:
     """Verify references thoroughly: all digests, all ranges, and that index and GeoPackage agree.
 
     `roadgeo locate` checks enough to be safe each time it opens a reference; this checks all, and takes longer.
@@ -99,7 +113,7 @@ def check_command(references: tuple[str, ...]) -> int:
     from roadgeo.reference.library import resolve_reference
 
     status = 0
-    for reference in references:
+    for reference in asked.references:
         try:
             problems = check_reference(resolve_reference(reference))
         except RoadgeoError as error:
@@ -113,9 +127,15 @@ def check_command(references: tuple[str, ...]) -> int:
     return status
 
 
-@reference_command.command("list", cls=Command, short_help="List the references in the library.")
-@take("json", help="Print one JSON object per reference and line.")
-def list_command() -> int:
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """What `roadgeo reference list` is asked."""
+
+    as_json: bool = take(Shared, "as_json", help="Print one JSON object per reference and line.", group=OTHERS)
+
+
+@command("list", List, group=reference_command, short_help="List the references in the library.")
+def list_command(_: List) -> int:
     """List the references in the library, which `roadgeo locate` searches without --reference.
 
     The library is a folder of the user's data; the environment variable ROADGEO_LIBRARY names another.
@@ -146,10 +166,16 @@ def list_command() -> int:
     return status
 
 
-@reference_command.command("remove", cls=Once, short_help="Remove references from the library.")
-@click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@row("-y --yes", "", OTHERS, "Do not ask.")
-def remove_command(names: tuple[str, ...], yes: bool) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Remove:
+    """What `roadgeo reference remove` is asked."""
+
+    names: tuple[str, ...] = argument("NAME...", many=True, type=None)
+    yes: bool = option("-y --yes", "", OTHERS, "Do not ask.")
+
+
+@command("remove", Remove, Once, group=reference_command, short_help="Remove references from the library.")
+def remove_command(asked: Remove) -> None:
     """Delete references from the library, both files of each.
 
     \b
@@ -159,11 +185,11 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
     """
     from roadgeo.reference.library import library_dir, remove_reference, shelved_files
 
-    for name in names:
+    for name in asked.names:
         shelved_files(name)  # a reference that is not there is not asked about
-    if not yes:
-        click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)
-    for name in names:
+    if not asked.yes:
+        click.confirm(f"Delete {', '.join(asked.names)} from {library_dir()}?", abort=True, err=True)
+    for name in asked.names:
         for path in remove_reference(name):
             echo(f"removed {path}")
 

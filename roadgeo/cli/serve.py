@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import select
 import signal
 import sys
 import threading
 import webbrowser
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -17,15 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo._options import OTHERS, option, part, take
 from roadgeo.cli import TERMINATED
 from roadgeo.cli.fencing import fence_of
-from roadgeo.cli.options import OTHERS, Command, each, n_threads, open_maps, row, take
+from roadgeo.cli.options import Known, Shared, Verbosity, command, n_threads, open_maps
 from roadgeo.cli.printing import echo, is_set
 from roadgeo.matching.hints import HINTS
+from roadgeo.serving.options import LOOPBACK, ServeOptions
 
 if TYPE_CHECKING:
     from roadgeo.flights.mavlink import MavlinkSender
-    from roadgeo.serving.options import ServeOptions
 
 __all__ = ["serve_command"]
 
@@ -74,53 +75,32 @@ def _help() -> str:
     return _HELP.format(hints="\n".join("  " + "  ".join(line) for line in lines))
 
 
-def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str:
-    """Check the address of a basemap's tiles: it goes into the page's policy.
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Serve:
+    """What `roadgeo serve` is asked."""
 
-    Raises
-    ------
-    click.BadParameter
-        It is no such address.
-    """
-    if url is None:
-        return ""
-    fits = re.fullmatch(r"https?://[\w.-]+(:\d+)?/[^\s;,\"'<>\\]*", url) and all(f"{{{axis}}}" in url for axis in "zxy")
-    if not fits:
-        raise click.BadParameter(
-            f"got {url!r}, expected an address such as https://tiles.example/{{z}}/{{x}}/{{y}}.png"
-        )
-    return url
-
-
-_OPTIONS = (
-    take("references"),
-    row("--host", "ADDRESS", OTHERS, "Listen there, and ask for a token. Default: 127.0.0.1, without one."),
-    row("--port", None, OTHERS, "0: any that is free.", type=click.IntRange(0, 65535), default=8017, show_default=True),
-    row("--token-file", "FILE", OTHERS, "The token is the first line of this file.", type=click.Path()),
-    take("jobs", help="Processes that locate. Default: 1."),
-    row("--waiting", "N", OTHERS, "Requests that may wait.", type=click.IntRange(0), default=8, show_default=True),
-    row("--max-bytes", "N", OTHERS, "Of a body.", type=click.IntRange(1), default=64_000_000, show_default=True),
-    row("--max-pixels", "N", OTHERS, "Of an image.", type=click.IntRange(1), default=64_000_000, show_default=True),
-    take("time_limit", default=10.0, help="Stop each search then. Default: 10; requests may ask for less."),
-    take("mavlink"),
-    row("--basemap", "URL", OTHERS,
-        "Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.", callback=_read_basemap),
-    row("--basemap-attribution", "TEXT", OTHERS, "Whom their owner asks to name.", default=""),
-    row("--no-browser", "", OTHERS, "Do not open the page in a browser."),
-    take("quiet"),
-)  # fmt: skip
+    references: tuple[str, ...] = take(Shared, "references")
+    host: str = take(ServeOptions, "host")
+    port: int = take(ServeOptions, "port")
+    token_file: str | None = option("--token-file", "FILE", OTHERS, "The token is the first line of this file.",
+        type=click.Path())
+    jobs: int = take(Shared, "jobs", help="Processes that locate. Default: 1.")
+    waiting: int = take(ServeOptions, "waiting")
+    max_bytes: int = take(ServeOptions, "max_bytes")
+    max_pixels: int = take(ServeOptions, "max_pixels")
+    time_limit_s: float = take(Known, "time_limit_s", default=10.0,
+        help="Stop each search then. Default: 10; requests may ask for less.")
+    mavlink: str | None = take(Shared, "mavlink")
+    basemap: str = take(ServeOptions, "basemap")
+    basemap_attribution: str = take(ServeOptions, "basemap_attribution")
+    no_browser: bool = option("--no-browser", "", OTHERS, "Do not open the page in a browser.")
+    verbosity: Verbosity = part(Verbosity, "quiet")
+# fmt: on
 
 
-@click.command(
-    "serve", cls=Command, is_fenced=False, short_help="A page to drop photographs on; answers over HTTP.", help=_help()
-)
-@each(_OPTIONS)
-def serve_command(
-    references: tuple[str, ...],
-    mavlink: str | None,
-    no_browser: bool,
-    **given: Any,
-) -> int:
+@command("serve", Serve, is_fenced=False, help=_help())
+def serve_command(asked: Serve) -> int:
     """Keep references open, and answer; for the help see above."""
     from roadgeo.errors import OutputError, RoadgeoError
     from roadgeo.flights.mavlink import MavlinkSender
@@ -129,13 +109,13 @@ def serve_command(
     from roadgeo.serving.workers import ImageWorkers
 
     # Compiled and opened here first: errors in the references are printed before anything listens.
-    options = _options(given)
-    maps = open_maps(references)
+    options = _options(asked)
+    maps = open_maps(asked.references)
     # The images of strangers are opened by processes inside a fence; this one may show the page in a browser.
-    fence = fence_of("serve", {"references": references}, ())
-    workers = ImageWorkers(references, options.workers, options.waiting, n_threads(options.workers), fence)
+    fence = fence_of("serve", {"references": asked.references}, ())
+    workers = ImageWorkers(asked.references, options.workers, options.waiting, n_threads(options.workers), fence)
     try:
-        sender = None if mavlink is None else MavlinkSender(mavlink)
+        sender = None if asked.mavlink is None else MavlinkSender(asked.mavlink)
         server = Server(Service(workers, maps, options, None if sender is None else partial(_tell, sender)))
     except RoadgeoError:
         workers.close()
@@ -149,7 +129,7 @@ def serve_command(
     address = f"http://{host}:{server.server_port}/"
     names = ", ".join(item.name for item in maps)
     echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
-    if not no_browser and _has_screen():
+    if not asked.no_browser and _has_screen():
         threading.Timer(0.5, webbrowser.open, [address]).start()
     ended_by: list[int] = []
 
@@ -208,7 +188,7 @@ def _tell(sender: MavlinkSender, document: dict[str, Any], came_s: float) -> Non
         sender.send(fix)
 
 
-def _options(given: dict[str, Any]) -> ServeOptions:
+def _options(asked: Serve) -> ServeOptions:
     """Put together what the server allows.
 
     Raises
@@ -216,19 +196,15 @@ def _options(given: dict[str, Any]) -> ServeOptions:
     click.UsageError
         Others may ask, and there is no token.
     """
-    from roadgeo.serving.options import LOOPBACK, ServeOptions
-
     token = os.environ.get("ROADGEO_TOKEN", "").strip()
-    if given["token_file"] is not None:
+    if asked.token_file is not None:
         try:
-            token = Path(given["token_file"]).read_text(encoding="utf-8").split("\n", 1)[0].strip()
+            token = Path(asked.token_file).read_text(encoding="utf-8").split("\n", 1)[0].strip()
         except (OSError, UnicodeDecodeError) as error:
             raise click.UsageError(f"Cannot read the token: {error}.") from error
         if not token:
-            raise click.UsageError(f"{given['token_file']} is empty, expected a token in its first line.")
-    host = given["host"] or "127.0.0.1"
-    if host not in LOOPBACK and not token:
+            raise click.UsageError(f"{asked.token_file} is empty, expected a token in its first line.")
+    if asked.host not in LOOPBACK and not token:
         raise click.UsageError("--host needs a token: set ROADGEO_TOKEN, or give --token-file FILE.")
-    alike = ("port", "waiting", "max_bytes", "max_pixels", "time_limit_s", "basemap", "basemap_attribution")
-    limits = {name: given[name] for name in alike} | {"connections": given["jobs"] + given["waiting"] + 64}
-    return ServeOptions(host=host, token=token, workers=given["jobs"], **limits)
+    alike = {each.name: getattr(asked, each.name) for each in fields(ServeOptions) if hasattr(asked, each.name)}
+    return ServeOptions(**alike, token=token, workers=asked.jobs, connections=asked.jobs + asked.waiting + 64)

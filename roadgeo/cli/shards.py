@@ -5,17 +5,20 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import Read, each, make_cluster, row
+from roadgeo.cli.options import make_cluster
 from roadgeo.cli.printing import tell
 
-__all__ = ["build_in_shards", "shard_options", "tell_built"]
+if TYPE_CHECKING:
+    from roadgeo.cli.index import Index
+
+__all__ = ["build_in_shards", "read_shards", "tell_built"]
 
 
-def _read_shards(text: str) -> dict[str, Any]:
+def read_shards(text: str) -> dict[str, Any]:
     """Read how a map is cut, as options of the build: "auto", about how many shards, or the side of square ones."""
     if text == "auto":
         return {}
@@ -27,20 +30,7 @@ def _read_shards(text: str) -> dict[str, Any]:
     raise ValueError(f"got {text!r}, expected auto, a number, or a side such as 25km (1 to 1000)")
 
 
-#: Adds the options that control how a map is cut.
-shard_options = each((
-    row("--shards", "auto|N|SIZEkm", "In pieces",
-        "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
-        type=Read("shards", _read_shards)),
-    row("--margin", "METRES", "In pieces",
-        "Ground that neighbours share. Half the diagonal of the largest frame to locate.",
-        type=click.FloatRange(0, 100_000), default=3000.0, show_default=True, rare=True),
-    row("-j --jobs", "N", "In pieces",
-        "Processes, each of which builds a piece at a time.", type=click.IntRange(1), default=1, show_default=True),
-))  # fmt: skip
-
-
-def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any]) -> None:
+def build_in_shards(asked: Index, name: str) -> None:
     """Build a reference in shards from road files, and describe the result.
 
     Raises
@@ -55,7 +45,8 @@ def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: 
     from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
     from roadgeo.storage.files import make_folder
 
-    if not source["roads"]:
+    out = asked.out
+    if not asked.roads:
         raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")
     # Target: a folder, in the library unless `--out` names another.
     started = perf_counter()
@@ -66,13 +57,13 @@ def build_in_shards(source: dict[str, Any], name: str, out: str | None, shards: 
         path = path.with_name(f"{path.name}{ENDING}")
     make_folder(path)
     # Sources and options.
-    which = (source[name] for name in ("layer", "crs", "kinds", "tunnels", "bbox", "attribution"))
-    files = RoadFiles(tuple(map(Path, source["roads"])), *which)
+    which = (asked.layer, asked.crs, asked.kinds, asked.tunnels, asked.bbox, asked.attribution)
+    files = RoadFiles(tuple(map(Path, asked.roads)), *which)
     compile_once(map_only=True)
     with show_steps() as say:
-        options, jobs = ShardOptions(**shards, margin_m=source["margin"]), source["jobs"]
-        cluster = make_cluster(source, jobs)
-        reference = build_shards(files, path, make_slug(name), options, jobs=jobs, cluster=cluster, say=say)
+        options = ShardOptions(**asked.shards or {}, margin_m=asked.margin)
+        cluster = make_cluster(asked.engine, asked.scheduler, asked.jobs)
+        reference = build_shards(files, path, make_slug(name), options, jobs=asked.jobs, cluster=cluster, say=say)
     entries = reference.manifest.filled
     n = sum(entry.own_intersections for entry in entries)
     tell_built(f"{path}: {n:,} intersections in {len(entries)} shards", started, out or path.stem)

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import click
-
+from roadgeo._options import part, take
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import Command, take
+from roadgeo.cli.options import Shared, Verbosity, argument, command
 from roadgeo.cli.printing import tell
 from roadgeo.cli.progress import count_up
-from roadgeo.cli.queries import query_options, query_sets
+from roadgeo.cli.queries import Queries, query_sets
 
 __all__ = ["simulate_command"]
 
 
-@click.command("simulate", cls=Command, short_help="Draw road masks whose place is known.")
-@click.argument("reference", metavar="REF")
-@take("out_dir", help="Where to write.", default=None, required=True)
-@query_options
-@take("quiet")
-def simulate_command(reference: str, out_dir: str, roads: Path | None, **options: Any) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """What `roadgeo simulate` is asked."""
+
+    reference: str = argument("REF", type=None)
+    out_dir: str = take(Shared, "out_dir", help="Where to write.", default=None, required=True)
+    drawn: Queries = part(Queries)
+    verbosity: Verbosity = part(Verbosity, "quiet")
+
+
+@command("simulate", Simulate)
+def simulate_command(asked: Simulate) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
     Writes NOISE/q_NNNN.png, footprints.gpkg, and truth.csv and truth.json, which hold for each mask the homography from
@@ -42,9 +47,9 @@ def simulate_command(reference: str, out_dir: str, roads: Path | None, **options
     from roadgeo.reference.library import resolve_whole
     from roadgeo.storage.files import make_folder, write_bytes
 
-    sets = query_sets(options)
-    landscape = read_landscape(resolve_whole(reference), roads)
-    folder, truths = Path(out_dir), []
+    sets = query_sets(asked.drawn)
+    landscape = read_landscape(resolve_whole(asked.reference), asked.drawn.roads)
+    folder, truths = Path(asked.out_dir), []
     with count_up(sum(count for _, count in sets)) as advance:
         for simulation, count in sets:
             make_folder(folder / simulation.kind)
@@ -53,5 +58,6 @@ def simulate_command(reference: str, out_dir: str, roads: Path | None, **options
                 write_bytes(folder / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
                 truths.append(query.truth)
                 advance(simulation.kind)
-    write_truth(out_dir, truths, made_by())
-    tell(f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True)
+    write_truth(asked.out_dir, truths, made_by())
+    how = f"roadgeo evaluate {asked.reference} --queries {asked.out_dir}"
+    tell(f"{len(truths)} masks in {asked.out_dir}; next: {how}", err=True)

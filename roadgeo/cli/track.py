@@ -7,27 +7,19 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from roadgeo._options import RESULTS, option, part, take
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.options import (
-    RESULTS,
-    Command,
-    Read,
-    each,
-    hinted,
-    make_options,
-    open_maps,
-    read_options,
-    row,
-    take,
-)
+from roadgeo.cli.options import Known, Shared, Verbosity, argument, command, make_options, open_maps, threaded
 from roadgeo.cli.printing import echo, is_set, paint, tell
+from roadgeo.running.options import SEGMENTING, ReadOptions
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
@@ -94,52 +86,45 @@ def _read_time(text: str) -> datetime:
     return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
 
 
-TIME = Read("time", _read_time)
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """What `roadgeo track` is asked."""
 
-
-_OPTIONS = (
-    take("references", "near", "within", "gsd", "max_tilt"),
-    take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's."),
-    take("out_dir"),
-    row("--name", None, RESULTS, "What the results are called. Default: flight.", default="flight", rare=True),
-    take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known."),
-    take("mavlink", group=RESULTS, rare=True),
-    row("--motion", "FILE", FLIGHT, "How each frame moved: see above.", type=click.Path()),
-    row("--motion-sigma", "PX", FLIGHT,
-        "How far off the motion may put a corner. Default: 1.5, of masks 12.",
-        type=click.FloatRange(min=0, min_open=True), rare=True),
-    row("--unordered", "", FLIGHT, "The frames are in no order; all are solved together."),
-    row("--every", "SECONDS", FLIGHT,
-        "Take a frame of a video every so often. Default: 1.", type=click.FloatRange(min=0), default=1.0),
-    row("--interval", "SECONDS", FLIGHT,
+    frames: tuple[str, ...] = argument("FRAMES...", many=True)
+    references: tuple[str, ...] = take(Shared, "references")
+    known: Known = part(Known, "near", "within", "gsd_m", "max_tilt_deg")
+    focal_px: float | Literal["exif"] | None = take(Known, "focal_px", form="PIXELS",
+        help="Focal length in pixels: places are then the camera's.")
+    out_dir: str = take(Shared, "out_dir")
+    name: str = option("--name", None, RESULTS, "What the results are called. Default: flight.",
+        default="flight", rare=True)
+    as_json: bool = take(Shared, "as_json", help="Print one JSON object per frame and line, as it is known.")
+    mavlink: str | None = take(Shared, "mavlink", group=RESULTS, rare=True)
+    motion: str | None = option("--motion", "FILE", FLIGHT, "How each frame moved: see above.", type=click.Path())
+    motion_sigma: float | None = option("--motion-sigma", "PX", FLIGHT,
+        "How far off the motion may put a corner. Default: 1.5, of masks 12.", limits=(0, None), above=True, rare=True)
+    unordered: bool = option("--unordered", "", FLIGHT, "The frames are in no order; all are solved together.")
+    every: float = option("--every", "SECONDS", FLIGHT,
+        "Take a frame of a video every so often. Default: 1.", limits=(0, None), default=1.0)
+    interval: float | None = option("--interval", "SECONDS", FLIGHT,
         "Time between images. Default: as EXIF states it, where all have times, else 1.",
-        type=click.FloatRange(min=0, min_open=True), rare=True),
-    row("--aspect", "RATIO", FLIGHT,
-        "How many times a pixel is as wide as high. Default: as the file states it, else 1.",
-        type=click.FloatRange(0.25, 4), rare=True),
-    row("--start", "TIME", FLIGHT, "When the first frame was taken.", type=TIME),
-    take("segment", "class_name", "mask_values"),
-    take("segmenter", metavar="MODEL.onnx", type=click.Path(), help="Who finds the roads."),
-    take("time_limit", group=FLIGHT, default=10.0, help="Stop each search then. Default: 10."),
-    take("recursive", group=FLIGHT, rare=True),
-    take("verbosity"),
-)  # fmt: skip
+        limits=(0, None), above=True, rare=True)
+    aspect: float | None = take(ReadOptions, "aspect", group=FLIGHT,
+        help="How many times a pixel is as wide as high. Default: as the file states it, else 1.")
+    start: datetime | None = option("--start", "TIME", FLIGHT, "When the first frame was taken.", read=_read_time)
+    reading: ReadOptions = part(ReadOptions, *(name for name in SEGMENTING if name != "segmenter"))
+    segmenter: str = take(ReadOptions, "segmenter", form="MODEL.onnx", help="Who finds the roads.",
+        plugins="", type=click.Path())
+    time_limit_s: float = take(Known, "time_limit_s", group=FLIGHT, default=10.0,
+        help="Stop each search then. Default: 10.")
+    recursive: bool = take(Shared, "recursive", group=FLIGHT, rare=True)
+    verbosity: Verbosity = part(Verbosity)
+# fmt: on
 
 
-@click.command("track", cls=Command, short_help="Follow a flight over the map, frame by frame.", help=_HELP)
-@click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
-@each(_OPTIONS)
-def track_command(
-    frames: tuple[str, ...],
-    references: tuple[str, ...],
-    out_dir: str,
-    name: str,
-    start: datetime | None,
-    mavlink: str | None,
-    focal_px: Any,
-    unordered: bool,
-    **given: Any,
-) -> int:
+@command("track", Track, help=_HELP)
+def track_command(asked: Track) -> int:
     """Follow a flight over the map, frame by frame; for the help see above."""
     from roadgeo.cli.progress import name_counts
     from roadgeo.flights.frames import follow_frames
@@ -147,29 +132,31 @@ def track_command(
     from roadgeo.flights.rows import make_rows
     from roadgeo.flights.tracker import TrackOptions
 
+    focal_px = asked.focal_px
     if focal_px == "exif":
         raise click.UsageError("--focal exif: of frames give the focal length in pixels.")
-    if unordered and (mavlink or given["motion"]):
+    if asked.unordered and (asked.mavlink or asked.motion):
         raise click.UsageError("--unordered frames are no flight: leave out --mavlink and --motion.")
-    options, reading = TrackOptions(locate=make_options(hinted(given))), _frame_options(given)
-    opened: Any = open_maps(references, given["near"])
-    make_folder(out_dir)
+    hints = replace(asked.known, time_limit_s=asked.time_limit_s)
+    options, reading = TrackOptions(locate=make_options(hints)), _frame_options(asked)
+    opened: Any = open_maps(asked.references, options.locate.near)
+    make_folder(asked.out_dir)
     # Frames are printed as they come; later knowledge of earlier ones replaces their rows.
     states: dict[int, Tracked] = {}
     pictures = Thumbnails()
-    with _sender(mavlink) as send:
-        for frame, news in follow_frames(frames, reading, opened, options, unordered):
+    with _sender(asked.mavlink) as send:
+        for frame, news in follow_frames(asked.frames, reading, opened, options, asked.unordered):
             pictures.add(frame.number, frame.mask)
             states.update({state.frame.number: _without_mask(state) for state in news})
-            fresh = make_rows(news, start, focal_px)
+            fresh = make_rows(news, asked.start, focal_px)
             send(fresh[-1])
             for row in fresh:
                 _print(row)
     tracked = [states[number] for number in sorted(states)]
     if not tracked:
-        raise click.UsageError(f"No frames in {', '.join(frames)}.")
-    rows = make_rows(tracked, start, focal_px)
-    files = _write(Path(out_dir), name, tracked, rows, pictures)
+        raise click.UsageError(f"No frames in {', '.join(asked.frames)}.")
+    rows = make_rows(tracked, asked.start, focal_px)
+    files = _write(Path(asked.out_dir), asked.name, tracked, rows, pictures)
     counts = Counter(row.status for row in rows)
     tell_accuracy(row.to_dict() for row in rows)
     tell(f"{len(rows)} frames: {name_counts(counts)}; wrote {', '.join(files)}", err=True)
@@ -197,26 +184,25 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
         yield send
 
 
-def _frame_options(given: dict[str, Any]) -> FrameOptions:
+def _frame_options(asked: Track) -> FrameOptions:
     from roadgeo.flights.frames import FrameOptions
     from roadgeo.flights.motion import read_motion
 
+    gsd_m = asked.known.gsd_m
     return FrameOptions(
-        reading=read_options(given),
-        gsd_m=given["gsd_m"],
-        motion=None if given["motion"] is None else read_motion(given["motion"]),
-        motion_px=given["motion_sigma"],
-        every_s=given["every"],
-        interval_s=given["interval"],
-        aspect=given["aspect"],
-        recursive=given["recursive"],
+        reading=threaded(replace(asked.reading, segmenter=asked.segmenter)),
+        gsd_m=None if isinstance(gsd_m, str) else gsd_m,
+        motion=None if asked.motion is None else read_motion(asked.motion),
+        motion_px=asked.motion_sigma,
+        every_s=asked.every,
+        interval_s=asked.interval,
+        aspect=asked.aspect,
+        recursive=asked.recursive,
     )
 
 
 def _without_mask(tracked: Tracked) -> Tracked:
     """Forget the pixels of a frame: a long flight has many."""
-    from dataclasses import replace
-
     import numpy as np
 
     from roadgeo.geometry.mask import RoadMask

@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import click
-
+from roadgeo._options import part, take
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
-from roadgeo.cli.options import Command, read_options, refuse_stated, take
+from roadgeo.cli.options import Shared, argument, command, hint, refuse_stated, threaded
 from roadgeo.cli.printing import complain, echo
 from roadgeo.cli.progress import show_steps
+from roadgeo.running.options import SEGMENTING, ReadOptions
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
     from roadgeo._progress import Say
-    from roadgeo.running.options import ReadOptions
 
 __all__ = ["vectorize_command"]
 
 
-@click.command("vectorize", cls=Command, short_help="Show what roads are seen in a mask or a photograph.")
-@click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@take("out_dir", "gsd", "recursive", "segmenting", "mask_values")
-def vectorize_command(
-    images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, recursive: bool, **given: Any
-) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Vectorize:
+    """What `roadgeo vectorize` is asked."""
+
+    images: tuple[str, ...] = argument("IMAGE...", many=True)
+    out_dir: str = take(Shared, "out_dir")
+    gsd_m: tuple[float, float] | None = hint("gsd")
+    recursive: bool = take(Shared, "recursive")
+    reading: ReadOptions = part(ReadOptions, *SEGMENTING)
+
+
+@command("vectorize", Vectorize)
+def vectorize_command(asked: Vectorize) -> int:
     """Show the roads and intersections seen in IMAGEs: the first thing to look at when one was not located.
 
     An image is a road mask or a photograph. For photo.jpg it writes
@@ -42,15 +49,15 @@ def vectorize_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.errors import RoadgeoError, is_of_memory
 
-    refuse_stated({"gsd_m": gsd_m})
-    make_folder(out_dir)
+    refuse_stated({"gsd_m": asked.gsd_m})
+    make_folder(asked.out_dir)
     compile_once()
-    reading = read_options(given)
+    reading = threaded(asked.reading)
     status = 0
     with show_steps() as say:
-        for task in name_tasks(find_masks(images, recursive)):
+        for task in name_tasks(find_masks(asked.images, asked.recursive)):
             try:
-                roads = _show(task, out_dir, gsd_m, reading, say)
+                roads = _show(task, asked.out_dir, asked.gsd_m, reading, say)
             except RoadgeoError as error:
                 complain(str(error))
                 status = ERROR

@@ -5,27 +5,17 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
+from roadgeo._options import IMAGE, OTHERS, RESULTS, option, part, take
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import (
-    IMAGE,
-    OTHERS,
-    RESULTS,
-    Command,
-    each,
-    find_tasks,
-    open_maps,
-    read_options,
-    row,
-    take,
-)
+from roadgeo.cli.options import Shared, Verbosity, argument, command, find_tasks, open_maps, threaded
 from roadgeo.cli.printing import complain, echo, is_set, paint, plain, tell
+from roadgeo.outputs.options import ImageOptions
+from roadgeo.running.options import SEGMENTING, ReadOptions
 from roadgeo.storage.files import make_folder
 
 if TYPE_CHECKING:
@@ -40,35 +30,39 @@ OFF = 4
 _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 
 
-_OPTIONS = (
-    take(
-        "references",
-        help="Map to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-    ),
-    take("out_dir", help="Where files go; made if missing. Default: here."),
-    take("json", group=RESULTS),
-    row("--report", "", RESULTS, "Of each image, a page for the browser: IMAGE_verify.html."),
-    row("--fix", "", RESULTS,
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """What `roadgeo verify` is asked."""
+
+    images: tuple[str, ...] = argument("IMAGE...", many=True)
+    references: tuple[str, ...] = take(Shared, "references",
+        help="Map to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.")
+    out_dir: str = take(Shared, "out_dir", help="Where files go; made if missing. Default: here.")
+    as_json: bool = take(Shared, "as_json")
+    report: bool = option("--report", "", RESULTS, "Of each image, a page for the browser: IMAGE_verify.html.")
+    fix: bool = option("--fix", "", RESULTS,
         "For each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and "
-        "IMAGE_fixed.points, for the QGIS Georeferencer."),
-    row("--in-place", "", RESULTS, "Correct the georeference of GeoTIFFs that are off themselves."),
-    row("--tolerance", "METRES", OTHERS,
+        "IMAGE_fixed.points, for the QGIS Georeferencer.")
+    in_place: bool = option("--in-place", "", RESULTS, "Correct the georeference of GeoTIFFs that are off themselves.")
+    tolerance: float = option("--tolerance", "METRES", OTHERS,
         "An image agrees if, on average over the frame, it is off by less.",
-        type=click.FloatRange(0.1, 100), default=3.0, show_default=True),
-    row("--reach", "METRES", OTHERS,
+        limits=(0.1, 100), default=3.0, show_default=True)
+    reach: float = option("--reach", "METRES", OTHERS,
         "How far off it may be: nothing beyond is reported.",
-        type=click.FloatRange(20, 2000), default=350.0, show_default=True, rare=True),
-    row("--max-turn", "DEG", OTHERS,
-        "By how much it may be turned.", type=click.FloatRange(0, 45), default=6.0, show_default=True, rare=True),
-    take("crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE),
-    take("recursive", "segmenting", "mask_values", "jobs", "verbosity"),
-)  # fmt: skip
+        limits=(20, 2000), default=350.0, show_default=True, rare=True)
+    max_turn: float = option("--max-turn", "DEG", OTHERS,
+        "By how much it may be turned.", limits=(0, 45), default=6.0, show_default=True, rare=True)
+    crs: str | None = take(ImageOptions, "crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE)
+    recursive: bool = take(Shared, "recursive")
+    reading: ReadOptions = part(ReadOptions, *SEGMENTING)
+    jobs: int = take(Shared, "jobs")
+    verbosity: Verbosity = part(Verbosity)
+# fmt: on
 
 
-@click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they claim to be.")
-@click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@each(_OPTIONS)
-def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: Any) -> int:
+@command("verify", Verify)
+def verify_command(asked: Verify) -> int:
     """Check whether georeferenced IMAGEs are where they claim to be, by the roads they show.
 
     An image is a road mask or a photograph with a place: a geotransform, control
@@ -96,37 +90,37 @@ def verify_command(images: tuple[str, ...], out_dir: str, jobs: int, **given: An
     from roadgeo.outputs.verification_files import write_table
     from roadgeo.running.processes import run
 
-    tasks = find_tasks(images, given)
-    settings = _settings(given, jobs)
+    tasks = find_tasks(asked.images, asked.recursive)
+    settings = _settings(asked)
     opened = open_maps(settings.references)
-    if given["fix"] or given["report"] or len(tasks) > 1:
-        make_folder(out_dir)
+    if asked.fix or asked.report or len(tasks) > 1:
+        make_folder(asked.out_dir)
     results: list[Verified] = []
     with count_up(len(tasks)) as count:
-        for task, verified in zip(tasks, run(tasks, settings, jobs), strict=True):
+        for task, verified in zip(tasks, run(tasks, settings, asked.jobs), strict=True):
             results.append(verified)
             count(verified.verdict)
-            stem = Path(out_dir) / task.stem
-            pages = [_write_page(verified, task.mask, stem, opened, settings)] if given["report"] else []
-            files = [*pages, *_correct(verified, Path(task.mask), stem, given["fix"], given["in_place"])]
+            stem = Path(asked.out_dir) / task.stem
+            pages = [_write_page(verified, task.mask, stem, opened, settings)] if asked.report else []
+            files = [*pages, *_correct(verified, Path(task.mask), stem, asked.fix, asked.in_place)]
             _report(verified, files)
     documents = [verified.document for verified in results]
     counts = Counter(verified.verdict for verified in results)
     if len(tasks) > 1:
-        write_table(Path(out_dir) / "roadgeo_verify.csv", documents)
-        tell(f"{name_counts(counts)}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
+        write_table(Path(asked.out_dir) / "roadgeo_verify.csv", documents)
+        tell(f"{name_counts(counts)}; all of them: {Path(asked.out_dir) / 'roadgeo_verify.csv'}", err=True)
     return ERROR if counts["error"] else OFF if counts["off"] else NOT_LOCATED if counts["unknown"] else 0
 
 
-def _settings(given: dict[str, Any], jobs: int) -> VerifyRun:
+def _settings(asked: Verify) -> VerifyRun:
     """Put together what was asked."""
     from roadgeo.matching.checking import CheckOptions
     from roadgeo.running.verifying import VerifyRun
 
     usual = CheckOptions()
-    search = replace(usual.search, reach_m=given["reach"], turn_deg=given["max_turn"])
-    options = replace(usual, tolerance_m=given["tolerance"], search=search)
-    return VerifyRun(given["references"], options, read_options(given, jobs), given["crs"])
+    search = replace(usual.search, reach_m=asked.reach, turn_deg=asked.max_turn)
+    options = replace(usual, tolerance_m=asked.tolerance, search=search)
+    return VerifyRun(asked.references, options, threaded(asked.reading, asked.jobs), asked.crs)
 
 
 def _write_page(

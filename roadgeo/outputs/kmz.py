@@ -14,7 +14,8 @@ from roadgeo.geometry.warping import MapGrid
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import mask_picture
-from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
+from roadgeo.outputs.options import ImageOptions
+from roadgeo.outputs.orthophoto import choose_target, read_preview
 from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.subject import Subject
 

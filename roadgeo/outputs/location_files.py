@@ -16,7 +16,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.outputs.orthophoto import ImageOptions
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.paths import OutputPaths
 from roadgeo.outputs.registry import ALWAYS, JSON, REGISTRY, STYLE, Output, find_outputs
 from roadgeo.outputs.subject import Subject

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,14 +27,13 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import transform
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import UPRIGHT, read_orientation
 from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
 
 __all__ = [
     "COMPRESSION",
-    "CompressionName",
-    "ImageOptions",
     "Target",
     "choose_target",
     "image_homography",
@@ -42,8 +41,6 @@ __all__ = [
     "warp_image",
 ]
 
-ResamplingName = Literal["nearest", "bilinear", "cubic", "lanczos"]
-CompressionName = Literal["deflate", "zstd", "jpeg", "webp"]
 
 _INTERPOLATION = {
     "nearest": cv2.INTER_NEAREST,
@@ -67,31 +64,6 @@ COMPRESSION: dict[str, dict[str, Any]] = {
     "webp": {"compress": "WEBP", "quality": 90},
 }
 _DRAWABLE = tuple(np.dtype(name) for name in ("uint8", "uint16", "int16", "float32", "float64"))  # by OpenCV
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """How a picture is drawn on the map.
-
-    Attributes
-    ----------
-    crs : str or None
-        Target CRS, as pyproj takes it; None: the location's own, metric one.
-    resolution : float or None
-        Pixel size in units of the target CRS; None: the picture's own at its centre.
-    resampling : {"nearest", "bilinear", "cubic", "lanczos"}
-        How values between pixels are found.
-    max_pixels : int
-        A larger result is made coarser.
-    compression : {"deflate", "zstd", "jpeg", "webp"}
-        How the file is compressed; the last two are lossy, for pictures of 8 bits and one or three bands.
-    """
-
-    crs: str | None = None
-    resolution: float | None = None
-    resampling: ResamplingName = "cubic"
-    max_pixels: int = 400_000_000
-    compression: CompressionName = "deflate"
 
 
 def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:

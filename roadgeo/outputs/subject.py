@@ -23,7 +23,8 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.drawing.layers import Box
 from roadgeo.outputs.drawing.svg import thin_lines
-from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography, read_preview
+from roadgeo.outputs.options import ImageOptions
+from roadgeo.outputs.orthophoto import Target, choose_target, image_homography, read_preview
 from roadgeo.outputs.paths import OutputPaths
 from roadgeo.outputs.placing import placement_of
 from roadgeo.roads.graph import RoadGraph

@@ -13,7 +13,7 @@ import numpy as np
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.outputs.orthophoto import ImageOptions
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.placing import placement_of
 from roadgeo.outputs.registry import FOOTPRINT, MATCH_POINTS, MATCHES, Output, find_outputs

@@ -6,60 +6,77 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from roadgeo._options import IMAGE, option
+
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.running.tasks import Task
     from roadgeo.sources.bands import Choice
 
-__all__ = ["BatchOptions", "ReadOptions", "is_model"]
+__all__ = ["SEGMENTING", "BatchOptions", "ReadOptions", "is_model"]
+
+#: How photographs and masks are read, of the options of `ReadOptions`.
+SEGMENTING = ("segment", "segmenter", "class_name", "threshold", "band", "bands")
 
 
+def read_bands(text: str) -> tuple[int, ...]:
+    """Read the numbers of a red, a green and a blue band.
+
+    Raises
+    ------
+    ValueError
+        They are none.
+    """
+    numbers = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
+    if len(numbers) != 3 or min(numbers) < 1:
+        raise ValueError(f"got {text!r}, expected R,G,B: three numbers from 1")
+    return tuple(numbers)
+
+
+# fmt: off
 @dataclass(frozen=True)
 class ReadOptions:
-    """How what is given is read.
+    """How an image is read; what each option means stands beside it.
 
     Attributes
     ----------
-    threshold : float or None
-        Values of a mask, or probabilities, above it are road. Default: by the histogram of the values.
-    band : int or None
-        The band that holds a mask, counted from 1.
-    segment : "auto", "always" or "never"
-        Whether photographs are recognised, everything is taken for one, or nothing.
-    segmenter : str
-        A plugin, or the file of a model (.onnx). Default: the model that ships.
-    class_name : str or None
-        The class of a model that is road, or the number that stands for road in a map of classes. Default: by the names
-        of the model's classes.
     names : tuple of str
         Names of the bands of an array.
     threads : int
         Threads of a model; fixed, so that results are the same on every run.
-    mirror : bool or None
-        Whether the input is mirrored. Default: as the georeference of its file states.
-    units : "auto", "pixels" or "metres"
-        Unit of roads that come as lines (see `sources.drawn_roads`).
-    layer : tuple of str
-        Layers of such roads, where their file has several.
-    aspect : float or None
-        How many times a pixel is as wide as high. Default: as the georeference of its file states, or once.
-    bands : (3,) tuple of int, or None
-        The red, green and blue band of a photograph, counted from 1. Default: by their names, or the first three.
     """
 
-    threshold: float | None = None
-    band: int | None = None
-    segment: Literal["auto", "always", "never"] = "auto"
-    segmenter: str = ""
-    class_name: str | None = None
-    threads: int = 1
-    mirror: bool | None = None
-    units: Literal["auto", "pixels", "metres"] = "auto"
-    layer: tuple[str, ...] = ()
-    aspect: float | None = None
-    bands: tuple[int, int, int] | None = None
+    mirror: bool | None = option("--mirror/--no-mirror", "", IMAGE,
+        "The image is mirrored (film scanned from its back), or is not. Default: as its file says.",
+        default=None, rare=True)
+    aspect: float | None = option("--aspect", "RATIO", IMAGE,
+        "How many times a pixel is as wide as high, of scans that are stretched. Default: as the file says, or 1.",
+        limits=(0.25, 4.0), rare=True)
+    segment: Literal["auto", "always", "never"] = option("--segment", None, IMAGE,
+        "Which images are photographs, whose roads are found first: those that look so, all, or none. Default: auto.",
+        default="auto", rare=True)
+    segmenter: str = option("--segmenter", "NAME|MODEL.onnx", IMAGE,
+        "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness or "
+        "STAC describe them. Default: the model that ships.",
+        plugins="roadgeo.segmenters", ending=".onnx", default="", rare=True)
+    class_name: str | None = option("--class", "NAME|N", IMAGE,
+        "Class of the model that is road, or its number in a map of classes. Default: by the names.", rare=True)
+    threshold: float | None = option("--threshold", "T", IMAGE,
+        "Values above T are road; of photographs, probabilities. Default: by the values.", rare=True)
+    band: int | None = option("--band", "N", IMAGE,
+        "Band that holds the mask. Default: by the bands.", limits=(1, None), rare=True)
+    bands: tuple[int, int, int] | None = option("--bands", "R,G,B", IMAGE,
+        "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
+        read=read_bands, rare=True)
+    units: Literal["auto", "pixels", "metres"] = option("--units", None, IMAGE,
+        "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
+        default="auto", show_default=True, rare=True)
+    layer: tuple[str, ...] = option("--layer", "NAME", IMAGE,
+        "Layer of roads that come as lines. Repeatable.", default=(), rare=True)
     names: tuple[str, ...] = ()
+    threads: int = 1
+    # fmt: on
 
     @property
     def choice(self) -> Choice:

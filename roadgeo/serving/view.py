@@ -24,7 +24,8 @@ from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
 from roadgeo.outputs.drawing.views import draw_picture
-from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
+from roadgeo.outputs.options import ImageOptions
+from roadgeo.outputs.orthophoto import choose_target, read_preview
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.placing import warp_picture
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output

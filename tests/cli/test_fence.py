@@ -3,15 +3,20 @@
 import os
 import re
 import shutil
+import sqlite3
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import click
 import pytest
 import rasterio
 from worlds.demo import DRONE
 from worlds.hostile import MAPS, MASKS, naming, virtual
 
+from roadgeo import plugins
+from roadgeo.cli import cli
 from roadgeo.cli.fencing import fence_of
 from roadgeo.storage.fence import abi_version
 from roadgeo.storage.folders import cache_dir
@@ -142,3 +147,14 @@ def test_a_photographs_mask_of_an_earlier_run_may_be_looked_at(tmp_path: Path) -
     read = fence_of("locate", {"images": ["photo.jpg"], "out_dir": str(tmp_path)}, ()).read
     assert str(tmp_path / "photo_mask.tif") in read
     assert str(tmp_path / "other_mask.tif") not in read
+
+
+def test_the_segmenter_of_another_package_may_be_read_and_may_fetch_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = EntryPoint("theirs", "sqlite3.dbapi2:connect", plugins.SEGMENTERS)
+    monkeypatch.setattr(plugins, "find_plugins", lambda group: {"theirs": theirs} if group == theirs.group else {})
+    command = cli.get_command(click.Context(cli), "locate")
+    assert command is not None
+    given = command.make_context("locate", ["photo.jpg", "--segmenter=theirs"]).params
+    fence = fence_of("locate", given, ())
+    assert str(Path(sqlite3.__file__).parent) in fence.read
+    assert fence.network

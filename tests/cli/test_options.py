@@ -14,12 +14,13 @@ from support.documents import commands
 
 import roadgeo
 from roadgeo.cli import COMMANDS, cli, main
-from roadgeo.cli.options import BOX, GSD, NEAR, RANGE, Read
-from roadgeo.matching.hints import HINTS, apply_hints
+from roadgeo.cli.options import Read
+from roadgeo.matching.hints import HINTS, apply_hints, read_box, read_gsd, read_place, read_range
 from roadgeo.matching.options import LocateOptions
 from roadgeo.serving.requests import read_query_string
 
-FOCAL = Read("focal", HINTS["focal"].read)
+FOCAL, GSD = Read("focal", HINTS["focal"].read), Read("gsd", read_gsd)
+BOX, NEAR, RANGE = Read("box", read_box), Read("near", read_place), Read("range", read_range)
 
 
 TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map(str), min_size=1, max_size=5).map(
@@ -92,6 +93,12 @@ def test_every_hint_is_an_option_of_locate_a_parameter_over_http_and_a_keyword_o
     keywords = inspect.signature(roadgeo.locate).parameters
     assert {name for name, keyword in keywords.items() if keyword.kind is keyword.KEYWORD_ONLY} - {"take"} == set(HINTS)
     assert all(f"  {hint.parameter}=" in shown("serve", "--help-all") for hint in HINTS.values())
+
+
+def test_other_keywords_are_refused_as_python_does() -> None:
+    for call, other in ((roadgeo.locate, "wide"), (roadgeo.track, "heading")):
+        with pytest.raises(TypeError, match=f"unexpected keyword argument '{other}'"):
+            call("photo.png", **{other: 1.0})
 
 
 def test_the_defaults_of_the_table_are_those_of_the_search() -> None:

@@ -16,7 +16,7 @@ from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Content, Location
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.outputs.orthophoto import ImageOptions
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import REGISTRY
 from roadgeo.outputs.subject import Subject

@@ -16,7 +16,7 @@ from roadgeo.geometry.placement import Matches
 from roadgeo.location import Content, Location
 from roadgeo.outputs.footprint import GROUND, OUTSIDE, ROAD
 from roadgeo.outputs.location_files import OutputOptions, write_location
-from roadgeo.outputs.orthophoto import ImageOptions
+from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.placing import placement_of
 from roadgeo.outputs.registry import OVERLAY, STYLE

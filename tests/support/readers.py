@@ -21,7 +21,7 @@ import pyproj
 import shapely
 from starlette.exceptions import HTTPException
 
-from roadgeo.cli.options import BOX, GSD, NEAR, RANGE, Read
+from roadgeo.cli.options import Read
 from roadgeo.cli.track import TIME
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
@@ -29,7 +29,7 @@ from roadgeo.evaluation.truth import read_truth
 from roadgeo.flights.frames import FrameOptions, _video
 from roadgeo.flights.motion import read_motion
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
-from roadgeo.matching.hints import HINTS
+from roadgeo.matching import hints
 from roadgeo.outputs.location_document import read_location
 from roadgeo.reference import index_file
 from roadgeo.reference.index_file import read_index
@@ -210,11 +210,11 @@ def apply(path: Path) -> None:
 
 
 _HINTS = {
-    b"N": NEAR.convert,
-    b"B": BOX.convert,
-    b"R": RANGE.convert,
-    b"C": Read("focal", HINTS["focal"].read).convert,
-    b"G": GSD.convert,
+    b"N": Read("near", hints.read_place).convert,
+    b"B": Read("box", hints.read_box).convert,
+    b"R": Read("range", hints.read_range).convert,
+    b"C": Read("focal", hints.HINTS["focal"].read).convert,
+    b"G": Read("gsd", hints.read_gsd).convert,
     b"M": TIME.convert,
     b"T": lambda text, *_: read_truths(text, explain=True),
 }
