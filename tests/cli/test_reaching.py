@@ -13,7 +13,7 @@ from support.documents import commands
 
 from roadgeo.cli import queries, shards
 from roadgeo.cli.locate import Locate, locate_command
-from roadgeo.cli.options import Known, Verbosity, fill, threaded
+from roadgeo.cli.options import Known, Method, Verbosity, fill, threaded
 from roadgeo.cli.track import Track, _frame_options, track_command
 from roadgeo.cli.vectorize import Vectorize, vectorize_command
 from roadgeo.cli.verify import Verify, _settings, verify_command
@@ -40,8 +40,8 @@ def own_fields(kind: type) -> set[str]:
     return {each.name for of in (kind, *parts.values()) if of not in WHOLE for each in fields(of)} - whole
 
 
-#: What is read elsewhere: how images are read and drawn, hints, and switches of whoever prints.
-WHOLE = {ReadOptions, ImageOptions, Known, Verbosity}
+#: What is read elsewhere: how images are read and drawn, hints, thresholds, and switches of whoever prints.
+WHOLE = {ReadOptions, ImageOptions, Known, Method, Verbosity}
 
 
 @pytest.mark.parametrize(("name", "command"), ALL, ids=[name for name, _ in ALL])
