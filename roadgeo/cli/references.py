@@ -39,8 +39,7 @@ def reference_command() -> None:
 class Info:
     """What `roadgeo reference info` is asked."""
 
-    reference: str | None = argument("REF", required=False)
-    plugins: bool = option("--plugins", "", OTHERS, "The same as `roadgeo --plugins`.", hidden=True)
+    reference: str = argument("REF")
     as_json: bool = take(Shared, "as_json", help="Print everything that is known as one JSON object.", group=OTHERS)
 
 
@@ -55,11 +54,6 @@ def info_command(asked: Info) -> None:
       roadgeo reference info boston-ma
       roadgeo reference info maps/porto.gpkg --json
     """
-    if asked.plugins:
-        list_plugins()
-        return
-    if asked.reference is None:
-        raise click.UsageError("Missing argument 'REF'.")
     from roadgeo.reference.inspection import describe_reference
     from roadgeo.reference.library import resolve_reference
 
@@ -81,9 +75,6 @@ def list_plugins() -> None:
         (plugin.group, plugin.name, f"{plugin.dist.name} {plugin.dist.version}" if plugin.dist else "", plugin.value)
         for plugin in installed
     ]
-    if is_set("as_json"):
-        echo(json.dumps([dict(zip(("group", "name", "package", "object"), line, strict=True)) for line in lines]))
-        return
     widths = [max((len(line[i]) for line in lines), default=0) for i in range(3)]
     for line in lines:
         echo("  ".join([*(text.ljust(width) for text, width in zip(line, widths, strict=False)), line[3]]))
