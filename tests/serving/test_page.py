@@ -16,7 +16,7 @@ from serving.test_server import Workers, running
 from support.browser import find_chromium
 from worlds.answers import moved
 
-from roadgeo.geometry.projection import to_lonlat
+from roadgeo.geometry.projection import metres_apart, to_lonlat
 from roadgeo.location import Reason
 from roadgeo.reference.reference import Reference
 from roadgeo.serving.app import Service
@@ -247,7 +247,7 @@ def test_one_of_two_places_is_chosen(page, served, hard):
     give(page, mask, "twins.png")
     wait_for(page, "Two places")
     expect(page.locator("#map .pin.place")).to_have_count(2)
-    page.click("#places li:first-child button")
+    page.click("#places li:first-child .take")
     wait_for(page, "Chosen by you")
     assert workers.asked[-1].hints["take"] == 1
 
@@ -265,7 +265,19 @@ def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
     give(page, mask, "far.png")
     wait_for(page, "Not located")
     expect(page.locator("#map .pin.place")).to_have_count(2)
-    page.click("#places li:nth-child(2) button")
+    rows = page.locator("#places li button:not(.take)")
+    expect(rows.nth(1)).to_contain_text(f"{workers.references[0].name}, ")
+    expect(rows.nth(1)).to_contain_text("score -1.0")
+    look = "import('./page/map.mjs').then(({ theMap }) => theMap().getCenter().toArray())"
+    rows.nth(0).click()
+    page.wait_for_timeout(300)
+    first = page.evaluate(look)
+    rows.nth(1).click()
+    page.wait_for_timeout(300)
+    second = page.evaluate(look)
+    assert metres_apart(np.array(first), np.array(second)) == pytest.approx(900.0, rel=0.2)
+    expect(page.locator("#status")).to_have_text("Not located")  # to look is not to take
+    page.click("#places li:nth-child(2) .take")
     wait_for(page, "Chosen by you")
     assert workers.asked[-1].hints["take"] == 2
     expect(page.locator("#reason")).to_contain_text("place 2 of 2")
@@ -339,6 +351,12 @@ def test_what_is_known_of_the_camera_is_asked_with(page, served, hard):
     assert hints["heading_deg"] == (round(locate(str(mask), workers.references).rotation_deg), 10.0)
     expect(page.locator("#heading-off")).to_have_value("10")
     assert hints["gsd_m"] == pytest.approx((0.8, 1.25))
+    page.click("#help summary")
+    page.check("#heading-stated")
+    page.click("#again")
+    wait_for(page, "Failed")
+    expect(page.locator("#reason")).to_contain_text("EXIF and XMP state no direction of its camera")
+    assert workers.asked[-1].hints["heading_deg"] == "exif"
 
 
 def test_it_is_all_done_by_keys(page, served, hard):

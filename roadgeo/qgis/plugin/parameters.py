@@ -278,6 +278,12 @@ _HINTS = _fold(
         QgsProcessingParameterNumber, "NEAR_RADIUS", "Within, metres", "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
     ),
+    Option(
+        QgsProcessingParameterBoolean, "NEAR_STATED", "Near where its camera says",
+        "In EXIF and XMP, with the errors of such statements. Pixel size and heading may be exif, too.",
+        "--near", {"defaultValue": False},
+        lambda values, name: ["--near=exif"] if values.get("Boolean", name) else [],
+    ),
     *(_option("locate", flag) for flag, row in _LOCATE.items() if row["is_hint"] and flag != "--near"),
 )  # fmt: skip
 _REPORT = _option(

@@ -119,17 +119,19 @@ export async function showAnswer(base, view, found) {
     map.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "outline-case");
   }
   setOpacity(opacity);
-  const box = place.outline.reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds());
-  if (found.status === "ambiguous") (found.alternatives ?? []).forEach(({ center }) => box.extend([center.lon, center.lat]));
-  fit(box);
+  const others = found.status === "ambiguous" ? onMap(found.alternatives, found.reference) : [];
+  fit(boxOf([...place.outline, ...others.map(({ center }) => [center.lon, center.lat])]));
 }
 
-/** Outline the best places of a refusal. */
+export const boxOf = (corners) => corners.reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds());
+const onMap = (places, reference) => (places ?? []).filter((one) => one.reference === reference);
+
+/** Outline the best places of a refusal, and look at those on the map of the first. */
 function showRefused(found) {
-  const rings = (found?.alternatives ?? []).map((one) => one.footprint_lonlat).filter(Boolean);
-  if (!rings.length) return;
-  set("outline", rings.map((ring) => feature("LineString", [...ring, ring[0]])));
-  fit(rings.flat().reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds()));
+  const places = (found?.alternatives ?? []).filter((one) => one.footprint_lonlat);
+  if (!places.length) return;
+  set("outline", places.map(({ footprint_lonlat: ring }) => feature("LineString", [...ring, ring[0]])));
+  fit(boxOf(onMap(places, places[0].reference).flatMap((one) => one.footprint_lonlat)));
 }
 
 function set(source, features) {

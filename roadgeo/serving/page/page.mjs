@@ -251,6 +251,7 @@ function facts(found, matches) {
   if (matches.length) {  // the largest come first
     rows.push(["Residuals", `median ${length(matches[matches.length >> 1].residual_m)}, largest ${length(matches[0].residual_m)}`]);
   }
+  if (found.stated_offset_m !== null) rows.push(["By its own word", `the middle is ${length(found.stated_offset_m)} from here`]);
   if (found.reference) rows.push(["Map", found.reference]);
   return rows;
 }
@@ -269,21 +270,22 @@ async function showFiles(entry) {
 
 function showPlaces(entry) {
   const { status, document: found } = entry;
-  if (status === "not_located") {
-    offer((found?.alternatives ?? []).map(({ center }) => center), "Take it", (i) => again(entry, { ...entry.hints, take: i + 1 }));
-  }
-  if (status !== "ambiguous") return;
-  const places = [found.center, ...found.alternatives.map((one) => one.center)].slice(0, 6);
-  offer(places, "It is this one", (i) => again(entry, { ...entry.hints, take: i + 1 }));
+  const take = (i) => again(entry, { ...entry.hints, take: i + 1 });
+  if (status === "not_located") offer(found?.alternatives ?? [], "Take it", take);
+  if (status === "ambiguous") offer([found, ...found.alternatives].slice(0, 6), "It is this one", take);
 }
 
-/** Show places by letters, on the map and in a list with a button each. */
-function offer(places, words, choosePlace) {
+/** Show places by letters, on the map and in a list: one button goes there, another takes it. */
+function offer(places, words, take) {
   $("places").querySelector("ol").replaceChildren(...places.map((place, i) => {
-    const letter = "ABCDEF"[i], take = () => choosePlace(i);
-    view.addMarker([place.lon, place.lat], letter, `Place ${letter}: ${words.toLowerCase()}`, "place").getElement().addEventListener("click", take);
-    const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `${words}: ${degrees(place)}`);
-    return make("li", {}, there);
+    const letter = "ABCDEF"[i], { lon, lat } = place.center, go = () => view.fit(view.boxOf(place.footprint_lonlat ?? [[lon, lat]]));
+    view.addMarker([lon, lat], letter, `Place ${letter}: look at it`, "place").getElement().addEventListener("click", go);
+    const where = [place.reference, degrees(place.center), place.log10_odds === null ? "" : `score ${place.log10_odds.toFixed(1)}`];
+    const there = make("button", { type: "button", onclick: go, title: "Look at it on the map" },
+      make("b", { textContent: letter }), make("span", { textContent: where.filter(Boolean).join(", ") }));
+    const taken = make("button", { type: "button", className: "take", onclick: () => take(i), textContent: words });
+    taken.setAttribute("aria-label", `${words}: place ${letter}`);
+    return make("li", {}, there, taken);
   }));
 }
 
@@ -307,8 +309,12 @@ function complain(text) {
 
 let pairs = [], waiting = null, picking = false;  // { pixel, lonlat }; a pixel that waits for its place
 
+const STATED = "exif", STATABLE = ["near", "gsd", "heading"];  // hints that a camera may state
+
 function resetHelp(entry) {
-  const { near, gsd, heading, maxTilt } = entry.hints;
+  const given = Object.entries(entry.hints).filter(([, value]) => value !== STATED);
+  const { near, gsd, heading, maxTilt } = Object.fromEntries(given);
+  STATABLE.forEach((name) => { $(`${name}-stated`).checked = entry.hints[name] === STATED; });
   const put = (id, value) => { $(id).value = value ?? ""; };
   setNear(near);
   put("heading", heading && round(heading[0]));
@@ -345,6 +351,7 @@ function readHints(size) {
   if (hints.gsd && !(hints.gsd[0] > 0 && hints.gsd[0] <= hints.gsd[1])) throw new Error("Pixel size: the first must not exceed the second.");
   if (number("heading") !== undefined) hints.heading = [number("heading"), number("heading-off") ?? 10];
   if (number("tilt") !== undefined) hints.maxTilt = number("tilt");
+  STATABLE.filter((name) => $(`${name}-stated`).checked).forEach((name) => { hints[name] = STATED; });
   return hints;
 }
 
