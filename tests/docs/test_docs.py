@@ -176,7 +176,7 @@ def test_the_commands_for_qgis_run_there(desk: Path, monkeypatch: pytest.MonkeyP
 def test_the_first_screen_holds_a_picture_and_two_commands() -> None:
     """One sets up and shows the main job, one sets up and tests; nothing more is asked of a newcomer."""
     first, second = [block.text for block in blocks(README) if block.language == "bash"][:2]
-    picture = re.search(r"!\[.*\]\((.*\.png)\)", README)
+    picture = re.search(r"!\[.*\]\((.*\.(?:png|jpg))\)", README)
     assert picture is not None
     assert (ROOT / picture[1]).stat().st_size < 300_000
     assert README[: README.index(second)].count("\n") < 30

@@ -79,9 +79,9 @@ FROM_CODE = [
 
 #: Page; what it says; what another page says, whose numbers are the same.
 FROM_PAGES = [
-    ("README.md", r"(\d+) of (\d+) are located, none wrongly", "docs/how-well.md", r"(\d+) of (\d+) masks are located"),
-    ("README.md", r"\[([\d,]+) of ([\d,]+)\]", "docs/how-well.md", r"full effort locates ([\d,]+) of ([\d,]+)"),
-    ("README.md", r"\[(\w+) of ([\d,]+) masks without", "docs/how-well.md", r"\*\*(\w+) of ([\d,]+) masks without"),
+    ("README.md", r"steep views \| (\d+) of (\d+) \| 0 \|", "docs/how-well.md", r"(\d+) of (\d+) masks are located"),
+    ("README.md", r"\| ([\d,]+) of ([\d,]+) \| 3 \|", "docs/how-well.md", r"full effort locates ([\d,]+) of ([\d,]+)"),
+    ("README.md", r"(\w+) of ([\d,]+) masks without", "docs/how-well.md", r"\*\*(\w+) of ([\d,]+) masks without"),
 ]
 
 
