@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
-from roadgeo.running.pool import Died, Pool, Work
+from roadgeo.running.pool import Lost, Pool, Work
 from roadgeo.running.processes import without_interrupts
 from roadgeo.storage.fence import Fence, current, is_started_inside
 from roadgeo.storage.folders import private_temporary_dir
@@ -64,7 +64,7 @@ class Cluster:
             Dask is not installed; there is no scheduler at the address, or it went away.
         """
         with self.connected() as client:
-            yield from Pool[Task, Result](DaskWorkers(client, work)).run(tasks, work)
+            yield from DaskWorkers(client, work).run(tasks, work)
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[Any]:
@@ -116,10 +116,8 @@ def _local_cluster(workers: int) -> Iterator[Any]:
         yield cluster
 
 
-class DaskWorkers:
-    """The workers of a cluster, ready for one kind of work (see `pool.Workers`)."""
-
-    died = "the workers that it was given to died, one after another"
+class DaskWorkers(Pool):
+    """The workers of a cluster, ready for one kind of work."""
 
     def __init__(self, client: Any, work: Any) -> None:
         """Take them as Dask's client knows them."""
@@ -138,8 +136,6 @@ class DaskWorkers:
 
         Raises
         ------
-        Died
-            Worker after worker died.
         RoadgeoError
             The scheduler went away.
         """
@@ -151,8 +147,8 @@ class DaskWorkers:
         self._under_way.add(future)
         try:
             return future.result()
-        except KilledWorker as error:
-            raise Died from error
+        except KilledWorker:
+            return Lost("died", "the workers that it was given to died, one after another")
         except (CancelledError, OSError) as error:
             raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
         finally:

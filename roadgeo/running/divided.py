@@ -35,7 +35,7 @@ from roadgeo.reference.opening import open_references
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.running.cluster import Cluster, DaskWorkers
 from roadgeo.running.locating import Locating, Outcome
-from roadgeo.running.pool import Lost, Pool
+from roadgeo.running.pool import Lost
 from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
     sizes = {name: _size(part) for name, part in able.items()}
     with cluster.connected() as client, Ahead(_AHEAD) as ahead:
         workers = DaskWorkers(client, _Map(locating.references))
-        locate = partial(_locate, Pool(workers), workers.names, sizes)
+        locate = partial(_locate, workers.do, workers.names, sizes)
         yield from ahead.map(lambda task: locating.do(task, asked, locate), tasks)
 
 
@@ -119,7 +119,7 @@ def _size(part: Part) -> int:
 
 
 def _locate(
-    pool: Pool[_Parts, _PartAnswer],
+    do: Callable[[_Parts], _PartAnswer | Lost],
     workers: Callable[[], Sequence[str]],
     sizes: Mapping[str, int],
     mask: RoadMask,
@@ -145,7 +145,7 @@ def _locate(
             against = 2.0 * math.log10(share)  # as in `Rivals`, for the whole map
             asked.append(_Parts(worker, query, names, options, against))
         with ThreadPoolExecutor(len(asked)) as threads:
-            return [_answer_of(answer, query) for answer in threads.map(pool.do, asked)]
+            return [_answer_of(answer, query) for answer in threads.map(do, asked)]
 
     all_parts = owners(list(sizes), here)
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))

@@ -1,25 +1,25 @@
 """One pool: tasks in, results in order. A worker that dies, takes too long or is called off is a result like others.
 
-Workers are processes of this machine (`Processes`) or of a cluster (`cluster`). A task whose worker died is done once
-more, alone where memory may have been the cause; then it is lost. No more results wait to be read than some for each
-worker, and no more tasks are under way than keep the workers busy.
+Workers are processes of this machine (`processes`) or of a cluster (`cluster`). A task whose worker died is done once
+more, in a batch with no other beside it, for memory may have been the cause; then it is lost. No more results wait to
+be read than some for each worker, and no more tasks are under way than keep the workers busy.
 """
 
 from __future__ import annotations
 
 import math
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 
-__all__ = ["Died", "Ended", "Lost", "Pool", "Ready", "Work", "Workers"]
+__all__ = ["Lost", "Pool", "Work"]
 
 Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
@@ -30,15 +30,11 @@ ResultOut = TypeVar("ResultOut", covariant=True)
 _UNREAD = 16
 
 
-class Ready(Protocol[TaskIn, ResultOut]):
-    """Makes workers ready; it travels to other processes, so it can be pickled."""
+class Work(Protocol[TaskIn, ResultOut]):
+    """The work done for each of many tasks; it travels to other processes, so it can be pickled."""
 
     def prepare(self) -> Callable[[TaskIn], ResultOut]:
         """Make a process ready (open the references) and return the function that does one task."""
-
-
-class Work(Ready[TaskIn, ResultOut], Protocol[TaskIn, ResultOut]):
-    """The work done for each of many tasks."""
 
     def give_up(self, task: TaskIn, reason: str) -> ResultOut:
         """Make the result of a task that is lost."""
@@ -60,60 +56,29 @@ class Lost:
     said: str
 
 
-class Died(Exception):  # noqa: N818 (what happened, not a fault of the caller)
-    """The worker died that had a task."""
+class Pool(ABC):
+    """Workers that do tasks; may be asked from several threads."""
 
-
-class Ended(Exception):  # noqa: N818 (as above)
-    """A task is not done, or no more, for a reason that doing it again would not change."""
-
-    def __init__(self, why: Literal["late", "called off", "no worker"], said: str) -> None:
-        super().__init__(said)
-        self.lost = Lost(why, said)
-
-
-class Workers(Protocol):
-    """Those who do tasks.
-
-    Attributes
-    ----------
-    died : str
-        Why a task is lost that they died of.
-    """
-
-    died: str
-
+    @abstractmethod
     def busy(self) -> int:
-        """Return how many tasks under way keep them busy; they may come and go."""
+        """Return how many tasks under way keep the workers busy; they may come and go."""
 
+    @abstractmethod
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Have one do a task, and return its result, or raise what the task raised.
+        """Have one do a task, and return its result, or why it is lost; raises what the task raised."""
 
-        Raises
-        ------
-        Died, Ended
-            There is no result.
-        """
-
+    @abstractmethod
     def close(self) -> None:
         """End all that they do."""
 
-
-class Pool(Generic[Task, Result]):
-    """Does tasks; may be asked from several threads."""
-
-    def __init__(self, workers: Workers, *, again_alone: bool = True) -> None:
-        """Take workers; where one died its task runs again with no other beside it, or at once."""
-        self.workers, self._again_alone, self._gate = workers, again_alone, _Gate()
-
     def do(
         self,
-        task: Task,
+        task: Any,
         patience_s: float = math.inf,
         say: Say = say_nothing,
         called_off: threading.Event | None = None,
-    ) -> Result | Lost:
-        """Do one task as soon as a worker is free.
+    ) -> Any:
+        """Do one task as soon as a worker is free, twice where the first one died, and return its result, or `Lost`.
 
         Parameters
         ----------
@@ -124,28 +89,22 @@ class Pool(Generic[Task, Result]):
         called_off : Event, optional
             Once it is set nobody waits for the result any more.
         """
-        called_off = called_off or threading.Event()
-        try:
-            for alone in (False, self._again_alone):
-                with suppress(Died), self._gate.passed(alone):
-                    result: Result = self.workers.ask(task, patience_s, say, called_off)
-                    return result
-        except Ended as ended:
-            return ended.lost
-        return Lost("died", self.workers.died)
+        asked = task, patience_s, say, called_off or threading.Event()
+        result = self.ask(*asked)
+        return self.ask(*asked) if _died(result) else result
 
     def run(self, tasks: Sequence[Task], work: Work[Task, Result]) -> Iterator[Result]:
         """Do all tasks and yield their results in order, each as soon as it and those before it are there.
 
         Who stops reading ends the workers.
         """
-        waiting, begun = iter(tasks), deque[Future[Result | Lost]]()
+        waiting, begun, once = iter(tasks), deque[Future[Any]](), (math.inf, say_nothing, threading.Event())
         threads = ThreadPoolExecutor(len(tasks) or 1, "roadgeo-pool")  # which starts no more than are busy
 
-        def begin() -> list[Future[Result | Lost]]:
-            busy, under_way = self.workers.busy(), [future for future in begun if not future.done()]
+        def begin() -> list[Future[Any]]:
+            busy, under_way = self.busy(), [future for future in begun if not future.done()]
             room = min(busy - len(under_way), _UNREAD * busy - len(begun))
-            more = [threads.submit(self.do, task) for task in islice(waiting, max(room, 0))]
+            more = [threads.submit(self.ask, task, *once) for task in islice(waiting, max(room, 0))]
             begun.extend(more)
             return under_way + more
 
@@ -156,30 +115,14 @@ class Pool(Generic[Task, Result]):
                     wait(under_way, return_when=FIRST_COMPLETED)
                     under_way = begin()
                 result = begun.popleft().result()
+                if _died(result):
+                    wait(under_way)
+                    result = self.ask(task, *once)
                 yield work.give_up(task, result.said) if isinstance(result, Lost) else result
         finally:
-            self.workers.close()
+            self.close()
             threads.shutdown(cancel_futures=True)
 
 
-class _Gate:
-    """Lets any number pass together, or one alone."""
-
-    def __init__(self) -> None:
-        self._changed, self._inside, self._closed = threading.Condition(), 0, False
-
-    @contextmanager
-    def passed(self, alone: bool) -> Iterator[None]:
-        """Wait until it is open, and hold it open for others, or closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: not self._closed)
-            self._closed = alone
-            self._changed.wait_for(lambda: not (alone and self._inside))
-            self._inside += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._inside -= 1
-                self._closed = self._closed and not alone
-                self._changed.notify_all()
+def _died(result: Any) -> bool:
+    return isinstance(result, Lost) and result.why == "died"

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Died, Ended, Pool, Ready, Work
+from roadgeo.running.pool import Lost, Pool, Work
 from roadgeo.storage import fence
 from roadgeo.storage.files import remove_own
 
@@ -42,6 +42,8 @@ _GRACE_S = 5.0
 _START_S = 120.0
 #: Interval of checks whether somebody still waits.
 _GLANCE_S = 0.25
+_WAITING: Any = ("waiting", None)
+_CALLED_OFF = Lost("called off", "it was called off")
 
 
 def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
@@ -53,7 +55,7 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
         yield from map(work.prepare(), tasks) if tasks else ()
         return
     _require_guard()
-    yield from Pool[Task, Result](Processes(work, min(jobs, len(tasks)))).run(tasks, work)
+    yield from Processes(work, min(jobs, len(tasks))).run(tasks, work)
 
 
 def _require_guard() -> None:
@@ -73,21 +75,19 @@ def _require_guard() -> None:
             )
 
 
-class Processes:
-    """Processes of this machine, each ready for one kind of work (see `pool.Workers`)."""
-
-    died = "the process that worked on it died (out of memory?)"
+class Processes(Pool):
+    """Processes of this machine, each ready for one kind of work."""
 
     def __init__(
         self,
-        work: Ready[Any, Any],
+        work: Any,
         count: int,
         *,
         grace_s: float = _GRACE_S,
         clean: Callable[[], None] | None = None,
         within: fence.Fence | None = None,
     ) -> None:
-        """Start them.
+        """Take what they need; each is started when it is first asked.
 
         Parameters
         ----------
@@ -101,56 +101,60 @@ class Processes:
         self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
         self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
         self.all = [_Process((work, clean, within or fence.current())) for _ in range(count)]
-        try:
-            for process in self.all:
-                process.start()
-                self._idle.put(process)
-        except BaseException:
-            self.close()
-            raise
+        for process in self.all:
+            self._idle.put(process)
 
     def busy(self) -> int:
         """Return how many tasks keep them busy: each has one, and the next one waits."""
         return 2 * len(self.all)
 
     def wait_until_ready(self) -> None:
-        """Wait until all have prepared; raises what the first raised that could not, or as `ask` does."""
-        for process in self.all:
-            process.ask(None, 0.0, say_nothing, threading.Event())
+        """Wait until all have prepared.
+
+        Raises
+        ------
+        RoadgeoError
+            One cannot be started, or ends; or what the first raised that could not prepare.
+        """
+        lost = [self._start(process) for process in self.all]
+        ready = [process.ask(None, 0.0, say_nothing, threading.Event()) for process in self.all if not any(lost)]
+        for each in filter(None, lost + ready):
+            raise RoadgeoError(f"a process ended before it was ready: {each.said}")
 
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
         """Have the next one that is free do a task. One that has no result for it is started anew."""
         process = self._idle.get()
         try:
             if called_off.is_set():
-                raise Ended("called off", "it was called off")
-            self._start(process)
-            try:
-                return process.ask(task, patience_s, say, called_off)
-            except (Died, Ended):
+                return _CALLED_OFF
+            if lost := self._start(process):
+                return lost
+            result = process.ask(task, patience_s, say, called_off)
+            if isinstance(result, Lost):
                 process.end(0.0)
-                with contextlib.suppress(Ended):
-                    self._start(process)
-                raise
+                self._start(process)
+            return result
         finally:
             self._idle.put(process)
 
-    def _start(self, process: _Process) -> None:
+    def _start(self, process: _Process) -> Lost | None:
         """Start a process that has ended, unless all are to end."""
         with self._lock:
             if self._closed:
-                raise Ended("no worker", "it is ending")
+                return Lost("no worker", "it is ending")
             try:
                 process.start()
             except OSError as error:
-                raise Ended("no worker", f"no process can be started: {error.strerror or error}") from error
+                return Lost("no worker", f"no process can be started: {error.strerror or error}")
+            return None
 
     def close(self) -> None:
         """End all."""
         with self._lock:
             self._closed = True
-            for process in self.all:
-                process.tell_to_end()
+            started = [process.process for process in self.all if process.process is not None]
+            for process in started:
+                process.terminate()
             until = time.monotonic() + self._grace_s
             for process in self.all:
                 process.end(until - time.monotonic())
@@ -176,8 +180,7 @@ class _Process:
         # A fork server loads the libraries once for all; elsewhere each process starts afresh.
         method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
         context: Any = multiprocessing.get_context(method)
-        if method == "forkserver":
-            context.set_forkserver_preload(_PRELOAD)
+        context.set_forkserver_preload(_PRELOAD)
         self._pipe, theirs = context.Pipe()
         with theirs:
             process = context.Process(target=_serve, args=(theirs, _log.level, *self.given), daemon=True)
@@ -186,37 +189,30 @@ class _Process:
         self.process, self._start_s = process, _START_S
 
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Return the result of a task, or raise what it raised; the first one waits until the process has prepared.
+        """Return the result of a task, or why it is lost, or raise what it raised.
 
-        Raises
-        ------
-        Died, Ended
-            There is none.
+        The first one waits until the process has prepared.
         """
-        patience_s += self._start_s
-        kind, until, said = "", time.monotonic() + patience_s, list[Any]()
+        patience_s, kind = patience_s + self._start_s, ""
+        until = time.monotonic() + patience_s
         while kind not in ("done", "failed"):
             left = until - time.monotonic()
-            if called_off.is_set() or left <= 0.0:
-                late = Ended("late", f"longer than {patience_s:g} s")
-                raise Ended("called off", "it was called off") if called_off.is_set() else late
+            if called_off.is_set():
+                return _CALLED_OFF
+            if left <= 0.0:
+                return Lost("late", f"longer than {patience_s:g} s")
             try:
                 if not kind:
                     self._pipe.send(task)
-                kind, *said = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else ("waiting",)
-            except (EOFError, OSError) as error:
-                raise Died from error
+                kind, said = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else _WAITING
+            except (EOFError, OSError):
+                return Lost("died", "the process that worked on it died (out of memory?)")
             if kind == "told":
-                say(said[0], said[1])
+                say(*said)
         self._start_s = 0.0
         if kind == "failed":
-            raise said[0]
-        return said[0]
-
-    def tell_to_end(self) -> None:
-        """Ask it to end."""
-        if (process := self.process) is not None:
-            process.terminate()
+            raise said
+        return said
 
     def end(self, grace_s: float) -> None:
         """End it, at once or after a time in which it may clean up."""
@@ -235,13 +231,13 @@ _parents: list[Connection] = []
 def tell(text: str, share: float | None = None) -> None:
     """Report how far this process's task is, to the process that waits for it."""
     for pipe in _parents:
-        pipe.send(("told", text, share))
+        pipe.send(("told", (text, share)))
 
 
 def _serve(
     pipe: Connection,
     level: int,
-    work: Ready[Any, Any],
+    work: Any,
     clean: Callable[[], None] | None,
     within: fence.Fence | None = None,
 ) -> None:
@@ -263,7 +259,9 @@ def _serve(
                 task = pipe.recv()
                 pipe.send((kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task))
     except SystemExit:  # the task has cleaned up
-        _leave()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
+        remove_own()
+        os._exit(128 + signal.SIGTERM)
 
 
 def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
@@ -274,12 +272,6 @@ def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
         with contextlib.suppress(Exception):
             return "failed", pickle.loads(pickle.dumps(error))  # noqa: S301 (from ourselves)
         return "failed", RuntimeError(f"{type(error).__name__}: {error}")
-
-
-def _leave() -> NoReturn:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
-    remove_own()
-    os._exit(128 + signal.SIGTERM)
 
 
 def end_with_parent(clean: Callable[[], None] | None = None) -> None:

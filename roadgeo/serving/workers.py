@@ -21,7 +21,7 @@ from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Died, Ended, Lost, Pool
+from roadgeo.running.pool import Lost
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
 
@@ -120,14 +120,11 @@ class ImageWorkers:
         within = fence and replace(fence, write=(*fence.write, own), temporary=own)
         work = Serving(tuple(references), threads)
         self._processes = Processes(work, count, grace_s=0.0, clean=clean, within=within)
-        self._pool = Pool[ImageRequest, Reply](self._processes, again_alone=False)
         self._places = threading.Semaphore(count + waiting)
         try:
             self._processes.wait_until_ready()
-        except BaseException as error:
+        except BaseException:
             self.close()
-            if isinstance(error, Died | Ended):
-                raise RoadgeoError("a process of the server ended while it opened the references") from error
             raise
 
     def take_place(self) -> ExitStack:
@@ -156,7 +153,7 @@ class ImageWorkers:
         """
         patience_s = request.time_limit_s + (_PATIENT_S if request.keeps else _GRACE_S)
         try:
-            reply = self._pool.do(request, patience_s, say, called_off)
+            reply: Reply | Lost = self._processes.do(request, patience_s, say, called_off)
         except RoadgeoError as error:  # a process that was started anew cannot open the references any more
             return Reply(503, {"detail": str(error)})
         if not isinstance(reply, Lost):

@@ -133,7 +133,7 @@ class Slow:
     def do(self, asked):
         time.sleep(0.3)
         self.limits.append(asked.options.search.time_limit_s)
-        return divided._Answer(Location("q", "not_located", "nothing"), [], asked.names)
+        return divided._PartAnswer(Location("q", "not_located", "nothing"), [], asked.names)
 
 
 def locate_on(pool, time_limit_s):
@@ -143,7 +143,7 @@ def locate_on(pool, time_limit_s):
     mask[30:34] = mask[:, 30:34] = True
     traced_s = read_query(RoadMask(mask)).seconds.vectorize
     found = divided._locate(
-        pool, lambda: ["tcp://one"], {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options
+        pool.do, lambda: ["tcp://one"], {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options
     )
     return found, traced_s
 

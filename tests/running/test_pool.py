@@ -9,19 +9,18 @@ from types import SimpleNamespace
 import pytest
 
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Died, Lost, Pool
+from roadgeo.running.pool import Lost, Pool
 from roadgeo.running.processes import Processes, tell
 
 GIVE_UP = SimpleNamespace(give_up=lambda task, reason: f"{task}: {reason}")
 
 
 @dataclass
-class Toys:
+class Toys(Pool):
     """Workers that answer with the task; `deaths` says how often they die of which."""
 
     count: int = 2
     deaths: dict[int, int] = field(default_factory=dict)
-    died: str = "they died"
     slow: int = -1
     begun: list[int] = field(default_factory=list)
     beside: dict[int, int] = field(default_factory=dict)
@@ -41,7 +40,7 @@ class Toys:
             time.sleep(0.002)
             if self.deaths.get(task, 0):
                 self.deaths[task] -= 1
-                raise Died
+                return Lost("died", "they died")
             return task
         finally:
             self.inside -= 1
@@ -52,7 +51,7 @@ class Toys:
 
 def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
     toys = Toys(4, {3: 1, 7: 2})
-    found = list(Pool(toys).run(range(20), GIVE_UP))
+    found = list(toys.run(range(20), GIVE_UP))
     assert [result for k, result in enumerate(found) if k != 7] == [k for k in range(20) if k != 7]
     assert found[7] == "7: they died"
     assert (toys.begun.count(3), toys.begun.count(7)) == (2, 2)
@@ -61,7 +60,7 @@ def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
 
 def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
     toys = Toys(2, slow=0)
-    results = Pool(toys).run(range(200), GIVE_UP)
+    results = toys.run(range(200), GIVE_UP)
     reader = threading.Timer(0.5, toys.goes_on.set)
     reader.start()
     assert next(results) == 0
@@ -73,7 +72,7 @@ def test_what_a_task_raises_is_raised_and_ends_the_workers() -> None:
     toys = Toys()
     toys.ask = lambda *_: 1 / 0
     with pytest.raises(ZeroDivisionError):
-        list(Pool(toys).run(range(3), GIVE_UP))
+        list(toys.run(range(3), GIVE_UP))
     assert toys.goes_on.is_set()
 
 
@@ -110,7 +109,7 @@ class _OddError(Exception):
 @pytest.fixture(scope="module")
 def pool():
     processes = Processes(Tasks(), 1, grace_s=0.0)
-    yield Pool(processes)
+    yield processes
     processes.close()
 
 
@@ -141,6 +140,6 @@ def test_processes_that_cannot_prepare_say_why() -> None:
     processes = Processes(Tasks(prepares=False), 1, grace_s=0.0)
     for _ in range(2):
         with pytest.raises(RoadgeoError, match="no map"):
-            Pool(processes).do("")
+            processes.do("")
     processes.close()
-    assert Pool(processes).do("").why == "no worker"
+    assert processes.do("").why == "no worker"

@@ -33,7 +33,7 @@ from roadgeo.location import Content, Location
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 from roadgeo.running.passes import Sighting
-from roadgeo.running.pool import Died
+from roadgeo.running.pool import Lost
 from roadgeo.serving.workers import ImageRequest, ImageWorkers, Serving, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
@@ -142,7 +142,7 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
 
 def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
     def broken(self, *_):
-        raise Died
+        return Lost("died", "it died")
 
     workers, request = one_worker
     with monkeypatch.context() as patch:
