@@ -1,8 +1,9 @@
 """Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
 
 BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
-The bands of the score are the same as in `error_rate` of a result. The table of worn masks counts the searches kept in
-`examples/trust/results`. `--check` writes nothing, and fails if a table would change.
+The bands of the score are the same as in `error_rate` of a result. The other tables count the searches that
+`examples/trust`, `examples/photographs` and `examples/peers` keep in their `results`. `--check` writes nothing, and
+fails if a table would change.
 """
 
 from __future__ import annotations
@@ -11,16 +12,24 @@ import argparse
 import csv
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from roadgeo.location import ERROR_RATES
+EXAMPLES = Path(__file__).resolve().parent
+sys.path[:0] = [str(EXAMPLES), str(EXAMPLES / "peers"), str(EXAMPLES / "photographs")]
 
-PAGE = Path(__file__).parents[1] / "docs" / "how-well.md"
-SEARCHES = Path(__file__).parent / "trust" / "results"
+import join  # noqa: E402
+import photographs  # noqa: E402
+import results  # noqa: E402
+
+from roadgeo.location import ERROR_RATES  # noqa: E402
+
+PAGE = EXAMPLES.parent / "docs" / "how-well.md"
+SEARCHES = EXAMPLES / "trust" / "results"
 #: A place is reported from this score on.
 NEEDED = 3.5
 WORN = {
@@ -94,6 +103,17 @@ def trust_table() -> Iterator[str]:
         yield f"| {band} | {rate.reported:,} | {at_most} |"
 
 
+def photographs_table() -> Iterator[str]:
+    """Yield the lines of the table of photographs."""
+    yield from photographs.count(EXAMPLES / "photographs" / "results" / "photographs.csv").splitlines()
+
+
+def peers_table() -> Iterator[str]:
+    """Yield the lines of the table of the authors' programs, on maps of 10 x 10 km."""
+    rows = results.read(join.FOLDER / "joined.csv")
+    yield from results.table(join.HEAD, join.table(rows, "10")).splitlines()
+
+
 def put(page: str, name: str, lines: Iterator[str]) -> str:
     """Return the page with another table between the comments of that name."""
     table = "\n".join(lines)
@@ -105,13 +125,15 @@ def put(page: str, name: str, lines: Iterator[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it scores alone")
+    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it the other tables")
     parser.add_argument("--check", action="store_true")
     options = parser.parse_args(arguments)
     before = page = PAGE.read_text(encoding="utf-8")
     if options.bench:
         page = put(page, "bench", bench_table(json.loads(options.bench.read_text(encoding="utf-8"))))
-    page = put(put(page, "worn", worn_table()), "trust", trust_table())
+    tables = {"worn": worn_table, "photographs": photographs_table, "peers": peers_table, "trust": trust_table}
+    for name, table in tables.items():
+        page = put(page, name, table())
     if options.check and page != before:
         raise SystemExit(f"Error: the tables of {PAGE.name} are out of date; run python examples/tables.py")
     if not options.check:

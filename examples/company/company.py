@@ -1,9 +1,10 @@
-"""Masks among many maps, false hints and repeated districts: what is easy alone, in company.
+"""Masks among many maps, false hints, repeated districts and mirrored blocks: what is easy alone, in company.
 
     export ROADGEO_DATA=/path/to/development/data     (the atlas of 33 cities)
     python examples/company/company.py shards         masks of five cities, on the atlas in shards
     python examples/company/company.py told           frames with a circle of 40 m on the wrong blocks, and on the right
     python examples/company/company.py twice          maps that hold a district twice
+    python examples/company/company.py mirrored       soft masks of grids, turned over: they have no place
     python examples/company/company.py table          count the results again
 
 Every search is a row in results/NAME.csv; a run that was stopped goes on where it was. Maps are built once, in --maps.
@@ -18,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class Case:
     """A mask to be located on a map; `city`, `kind` and `k` name it.
 
     It is the `number`-th mask of a kind of `examples/bench.py`, drawn of `roads`. `circle` is "true" or "false" where
-    scale, heading and a circle are given.
+    scale, heading and a circle are given. A mirrored mask is soft, as a network draws it.
     """
 
     city: str
@@ -73,6 +74,7 @@ class Case:
     mask: str
     number: int
     circle: str = ""
+    mirrored: bool = False
 
     @property
     def key(self) -> dict[str, Any]:
@@ -80,10 +82,12 @@ class Case:
 
     def draw(self, seed: int) -> SimulatedQuery | None:
         """Draw the mask; None where the roads have no place for one."""
+        options = options_of(self.mask, "turned over" if self.mirrored else "", seed)
         try:
-            return simulate_query(landscape_of(self.roads), options_of(self.mask, seed=seed), self.number)
+            query = simulate_query(landscape_of(self.roads), options, self.number)
         except RoadSourceError:
             return None
+        return replace(query, mask=soften(query.mask, np.random.default_rng(self.k))) if self.mirrored else query
 
     def hints(self, query: SimulatedQuery) -> dict[str, Any]:
         """Return the scale within 7 %, the heading within 8 degrees, and a circle; or nothing."""
@@ -129,6 +133,15 @@ def landscape_of(roads: Path) -> Landscape:
     return Landscape.from_lines(read.lines, read.plane)
 
 
+def soften(mask: Any, rng: np.random.Generator) -> Any:
+    """Return a mask, (H, W) uint8, as a network would draw it: blurred roads in a haze."""
+    height, width = mask.shape
+    coarse = rng.standard_normal((height // 40 + 2, width // 40 + 2)).astype(np.float32)
+    haze = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 4.0)
+    return np.clip(0.8 * blurred + 18.0 + 14.0 * haze, 0.0, 255.0).astype(np.uint8)
+
+
 # --- a map of many cities ---------------------------------------------------------------------------------------------
 
 
@@ -165,6 +178,19 @@ def look_alike(query: SimulatedQuery, roads: Path) -> tuple[float, float]:
 def drawn_map(roads: Path, side: int) -> DrawnMap:
     landscape = landscape_of(roads)
     return DrawnMap(shapely.transform(landscape.lines, landscape.plane.to_crs), side)
+
+
+# --- mirrored masks ---------------------------------------------------------------------------------------------------
+
+
+def mirrored(setting: Setting) -> Iterator[Case]:
+    """Frames whose blocks may nearly equal their mirror image."""
+    for k in range(setting.count):
+        for city in setting.cities or ALIKE:
+            roads = setting.roads(city)
+            reference = setting.build(roads, f"{roads.stem}.gpkg")
+            for frame in ("frame512", "frame800"):
+                yield Case(city, frame, k, reference, roads, frame, k, mirrored=True)
 
 
 # --- districts that stand twice ---------------------------------------------------------------------------------------
@@ -226,7 +252,7 @@ def measure(cases: Iterator[Case], seed: int, out: Path) -> None:
         hints = case.hints(query)
         opened = open_map(case.reference)
         started = time.process_time()
-        answer = roadgeo.locate(query.mask > 0, opened, **hints)
+        answer = roadgeo.locate(query.mask, opened, **hints)
         seconds = time.process_time() - started
         radius = max(20.0, 0.02 * query.truth.properties["gsd_m"] * max(query.truth.size))
         found = score(query.truth, answer.to_dict(), radius)
@@ -265,7 +291,7 @@ SAID = (("status", "ambiguous"), ("code", "fits_elsewhere"))
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    sets = {"shards": shards, "told": told, "twice": twice}
+    sets = {"shards": shards, "told": told, "twice": twice, "mirrored": mirrored}
     parser.add_argument("what", choices=[*sets, "table"])
     parser.add_argument("-n", "--count", type=int, default=6, help="masks of each kind and city; `twice`: maps of each")
     parser.add_argument("--seed", type=int, default=72)
@@ -280,7 +306,8 @@ def main(arguments: list[str] | None = None) -> None:
         setting = Setting(options.maps, options.atlas, options.seed, options.count, tuple(options.cities))
         measure(sets[options.what](setting), options.seed, options.out / f"{options.what}.csv")
     for name in sets if options.what == "table" else (options.what,):
-        print(f"\n{name}\n\n{count(options.out / f'{name}.csv')}")
+        if (options.out / f"{name}.csv").is_file():
+            print(f"\n{name}\n\n{count(options.out / f'{name}.csv')}")
 
 
 if __name__ == "__main__":

@@ -81,6 +81,12 @@ FROM_CODE = [
 FROM_PAGES = [
     ("README.md", r"steep views \| (\d+) of (\d+) \| 0 \|", "docs/how-well.md", r"(\d+) of (\d+) masks are located"),
     ("README.md", r"\| ([\d,]+) of ([\d,]+) \| 3 \|", "docs/how-well.md", r"full effort locates ([\d,]+) of ([\d,]+)"),
+    (
+        "README.md",
+        r"data \| (\d+) of (\d+) \((\d+) to (\d+) %\)",
+        "docs/how-well.md",
+        r"blind \| (\d+) of (\d+) \((\d+) to (\d+) %\)",
+    ),
     ("README.md", r"(\w+) of ([\d,]+) masks without", "docs/how-well.md", r"\*\*(\w+) of ([\d,]+) masks without"),
 ]
 
@@ -95,6 +101,39 @@ def said(page: str, sentence: str) -> tuple[str, ...]:
 def value(text: str) -> float:
     """Return the number that a text is, in digits or a word."""
     return WORDS[text] if text in WORDS else float(text.replace(",", ""))
+
+
+#: A command of this repository, or a folder of its examples that keeps results.
+SOURCE = re.compile(r"`roadgeo \w+|`python\s+examples/|\]\((\.\./)?examples/|`examples/\w")
+
+
+def parts(page: str, mark: str) -> dict[str, str]:
+    """Return the parts of a page by their first lines; each begins with a mark."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    found = re.split(rf"^{mark}", text, flags=re.MULTILINE)[1:]
+    return {part.splitlines()[0]: part for part in found}
+
+
+def anchor(heading: str) -> str:
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def has_number(text: str) -> bool:
+    """Whether a text states a number, beside those in code, links and comments."""
+    return bool(re.search(r"\d", re.sub(r"`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text)))
+
+
+def test_a_section_with_numbers_names_the_command_or_the_results_that_they_come_from():
+    sections = parts("docs/how-well.md", "## ")
+    assert [name for name, text in sections.items() if has_number(text) and not SOURCE.search(text)] == []
+
+
+def test_a_number_of_the_readme_leads_to_the_section_that_it_comes_from():
+    how_well = parts("README.md", "## ")["How well"].replace("The range is a 95 % interval.", "")
+    known = [f"](docs/how-well.md#{anchor(name)})" for name in parts("docs/how-well.md", "## ")]
+    *rows, text = [block for block in re.split(r"\n(?=\|)|\n\n", how_well) if block.strip()]
+    said = [one for one in [*rows, *re.split(r"\.\s", text)] if has_number(one)]
+    assert [one for one in said if not any(link in one for link in known)] == []
 
 
 def test_pages_state_the_numbers_of_the_code():

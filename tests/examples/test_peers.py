@@ -81,7 +81,7 @@ def test_all_in_a_row_are_counted_on_the_same_queries(example) -> None:
     ours[2] |= {"found": "0"}
     rows = list(join.joined(programs, ours))
     assert len(rows) == 2  # the third query was not searched for
-    assert list(join.table(rows, "10")) == [["version 1", "clean", "2", "1, 1 wrong", "1", "-", "2"]]
+    assert list(join.table(rows, "10")) == [["version 1", "clean", "2", "1, 1 wrong", "1", "2"]]
 
 
 def test_the_kept_rows_are_joined(example) -> None:
