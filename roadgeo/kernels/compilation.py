@@ -225,35 +225,23 @@ def _kinds(function: Callable[..., Any], writes: tuple[str, ...]) -> tuple[tuple
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
 
-#: Modules whose kernels every search needs: the first draw masks and maps, the second match them. The kernels of the
-#: paper's method are compiled on its first use.
-_DRAWING = ("simplification", "parallel_roads", "thinning", "tracing", "intersections", "buckets", "triple_codes")
-_MATCHING = (
-    "roads",
-    "triples",
-    "point_matching",
-    "growth",
-    "adjustment",
-    "road_raster",
-    "road_rings",
-    "road_votes",
-    "road_growth",
-)
+#: Modules whose kernels every search needs: two groups that take equally long, and share few kernels, each compiled by
+#: a process of its own in this order. What a map needs stands first. The kernels of the paper's method are compiled on
+#: its first use.
+_DRAWING = ("simplification", "parallel_roads", "intersections", "buckets", "triple_codes")
+_LOCATING = ("point_matching", "adjustment", "growth", "road_raster", "road_rings", "road_votes", "road_growth")
+_GROUPS = ((*_DRAWING, "thinning", "tracing", "triples"), ("roads", *_LOCATING))
 #: The kernels that a map needs: the first thing that a newcomer makes.
-_MAPS = ("simplification", "parallel_roads", "intersections", "buckets", "triple_codes", "roads")
-#: Modules that processes of their own compile, each in this order.
-_GROUPS = (
-    _MAPS,
-    ("thinning", "tracing", "triples", "point_matching"),
-    ("growth", "adjustment", "road_raster", "road_rings", "road_votes", "road_growth"),
-)
+_MAPS = (*_DRAWING, "roads")
+#: Those that match what was drawn.
+_MATCHING = ("roads", "triples", *_LOCATING)
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []
 
 
 def modules_of_the_search() -> list[str]:
     """Names of the modules whose kernels every search needs."""
-    return [f"roadgeo.kernels.{name}" for name in (*_DRAWING, *_MATCHING)]
+    return [f"roadgeo.kernels.{name}" for group in _GROUPS for name in group]
 
 
 def modules_of_maps() -> list[str]:

@@ -114,7 +114,8 @@ def vertex_codes(
             place = min(n, limit - 1)
             while place > 0 and openness[place - 1] < between:
                 openness[place] = openness[place - 1]
-                out[place] = out[place - 1]
+                for column in range(3):  # a row at once would take numba a tenth of all compilation
+                    out[place, column] = out[place - 1, column]
                 place -= 1
             openness[place] = between
             first, second = (p, q) if units[p] <= units[q] else (q, p)
