@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import islice
+from itertools import islice, zip_longest
 
 import numpy as np
 
@@ -159,7 +159,8 @@ class TripleEstimator:
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
-        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
+        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do where units
+        are searched alone, too, for the rarest triples of all have been looked up on all of them together.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
@@ -167,13 +168,14 @@ class TripleEstimator:
         if self.proposed is not None:
             yield iter([self.proposed])
         if self.in_company:
-            yield from sweeps[:1]
+            yield from sweeps
             return
         if not by_roads:
             yield from sweeps
             return
         roads = [self._rounds_of_roads()]
-        yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
+        roads_first = self.index.coarseness > 1.0 or self.sweeps.alone
+        yield from roads + sweeps if roads_first else sweeps + roads
 
     @property
     def work(self) -> float:
@@ -193,32 +195,33 @@ class TripleEstimator:
         self.ledger.n_tried += n_places
 
     def _rounds_of_roads(self) -> Iterator[list[Place]]:
-        """Yield places that grew by roads and were not met before."""
+        """Yield places that grew by roads from an anchor, on all units, and were not met before."""
         met: list[Place] = []
-        for anchor, n_tried, n_proposed, grown in self._votes_of_roads():
-            self._count(n_tried)
-            self.n_hypotheses += n_proposed
-            self._look_for(anchor)
-            self.events.note("voted", anchor, n_proposed)
+        for rounds in self._votes_of_roads():
             fresh: list[Place] = []
-            for place in grown:
-                is_met = any(self._is_met_again(other, place) for other in met)
-                if not is_met and not any(other.same(place) for other in fresh) and self._is_plausible(place):
-                    fresh.append(place)
+            for anchor, n_tried, n_proposed, grown in rounds:
+                self._count(n_tried)
+                self.n_hypotheses += n_proposed
+                self._look_for(anchor)
+                self.events.note("voted", anchor, n_proposed)
+                for place in grown:
+                    is_met = any(self._is_met_again(other, place) for other in met)
+                    if not is_met and not any(other.same(place) for other in fresh) and self._is_plausible(place):
+                        fresh.append(place)
             met += fresh
             self.events.note("grown", [place.matrix for place in fresh])
             yield fresh
 
-    def _votes_of_roads(self) -> Iterator[RoadRound]:
-        """Yield the rounds of a search by roads: of each unit, where the map is searched alone."""
-        camera, ahead = self.options.camera, self.sweeps.ahead
+    def _votes_of_roads(self) -> Iterator[list[RoadRound]]:
+        """Yield the rounds of an anchor: one, or one of each unit, where the map is searched alone."""
+        args = self.scene, self.index, self.options.camera, self.near, self.sweeps.ahead
         if not self.sweeps.alone:
-            turnout = self.sweeps.turnout(self.index.coarseness)
-            yield from RoadSearch(self.scene, self.index, camera, self.near, ahead, turnout).rounds()
-            return
-        for unit in range(n_units(len(self.index))):
-            (own,) = np.nonzero(self.units == unit)
-            yield from RoadSearch(self.scene, self.index, camera, self.near, ahead, Turnout(len(own)), own).rounds()
+            searches = [RoadSearch(*args, self.sweeps.turnout(self.index.coarseness))]
+        else:
+            units = (np.flatnonzero(self.units == unit) for unit in range(n_units(len(self.index))))
+            searches = [RoadSearch(*args, Turnout(len(own)), own) for own in units]
+        for rounds in zip_longest(*(search.rounds() for search in searches)):
+            yield [one for one in rounds if one is not None]
 
     def _look_for(self, anchor: int) -> None:
         """Count an intersection of the query that is looked up on the map."""

@@ -26,9 +26,9 @@ from roadgeo.matching.parts import Part, Whole
 from roadgeo.matching.picture import by_picture
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import N_KNOWN, Rivals
-from roadgeo.matching.road_search import COARSE_PIXEL_M
+from roadgeo.matching.road_search import COARSE_PIXEL_M, make_raster
 from roadgeo.matching.scene import Query
-from roadgeo.matching.search import Ahead, Search, search_in_turn, search_together
+from roadgeo.matching.search import Ahead, Search, search_together
 from roadgeo.matching.triples import larger, n_units
 from roadgeo.storage.memory import let_pages_go
 
@@ -186,7 +186,7 @@ def _search(
     sweeps.end()
     if units > 1 and not any(search.stopped in ("accepted", "time") for search in estimators):
         left, scale = left - (time.perf_counter() - started), float(units)
-        estimators = _search_alone(together, options, ledger, left)
+        estimators = _search_alone(together, options, ledger, left, ahead)
         rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     searches = iter(estimators)
     return [
@@ -196,22 +196,21 @@ def _search(
 
 
 def _search_alone(
-    estimators: Sequence[TripleEstimator], options: LocateOptions, ledger: Ledger, time_limit_s: float
+    estimators: Sequence[TripleEstimator], options: LocateOptions, ledger: Ledger, time_limit_s: float, ahead: Ahead
 ) -> dict[Search[Place], TripleEstimator]:
-    """Search each part, and each unit of it, as if it were alone, a stage of each in turn.
+    """Search each part, and each unit of it, as if it were alone: leads compete, each on its own part.
 
     The more is searched in all, by the `ledger`, the more a place must lead.
     """
     for estimator in estimators:
         estimator.leave_company()
+    if options.effort == "full":  # roads propose first
+        list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
     searches = {Search(estimator): estimator for estimator in estimators}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
-    work_s = options.search.work_limit_s
-    limits = [
-        replace(options.search, time_limit_s=time_limit_s, work_limit_s=n_units(len(estimator.index)) * work_s)
-        for estimator in estimators
-    ]
-    search_in_turn(list(searches), limits, lambda search: rivals([search]) is not None)
+    work_s = options.search.work_limit_s * sum(n_units(len(estimator.index)) for estimator in estimators)
+    limits = replace(options.search, time_limit_s=time_limit_s, work_limit_s=work_s)
+    search_together(list(searches), limits, rivals.leading)
     for estimator in estimators:
         estimator.sweeps.end()
     return searches

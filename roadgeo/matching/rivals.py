@@ -117,6 +117,10 @@ class Rivals:
             return None
         return None if any(self._rivals(part, place) for part in parts if part is not best) else best
 
+    def leading(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
+        """Return a part whose likeliest place leads all others of the same part by twice the score needed, or None."""
+        return next((part for part in parts if part.best is not None and self([part]) is not None), None)
+
     def _rivals(self, part: Search[Place], best: Place) -> bool:
         """Return whether another part has another place that explains nearly as much as the best place of all."""
         least = best.explained - self.needed * best.statement_px

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search_in_turn", "search_together"]
+__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search_together"]
 
 
 Model = TypeVar("Model")
@@ -180,47 +180,6 @@ def _search(
             return "accepted"
         stage += 1
     return "exhausted"
-
-
-def search_in_turn(
-    parts: Sequence[Search[Model]],
-    options: Sequence[SearchOptions],
-    proves: Callable[[Search[Model]], bool],
-) -> None:
-    """Search each part as if there were no other, a stage of each in turn, until an answer stands out on its own part.
-
-    Each part has limits of its own. `proves` returns whether a part's answer stands out there; it is called when an
-    answer reaches `SearchOptions.accept`, and after each stage.
-    """
-    budgets = [_Budget(own) for own in options]
-    accepted = False
-    while not accepted and any(_goes_on(part) for part in parts):
-        for part, own, budget in zip(parts, options, budgets, strict=True):
-            if _goes_on(part) and _finish_stage(part, own, budget, proves):
-                part.stopped, accepted = "accepted", True
-                break
-    for part in parts:
-        part.stopped = part.stopped or ("exhausted" if part.ended else "elsewhere")
-
-
-def _goes_on(part: Search[Model]) -> bool:
-    return not part.ended and not part.stopped
-
-
-def _finish_stage(
-    part: Search[Model], options: SearchOptions, budget: _Budget, proves: Callable[[Search[Model]], bool]
-) -> bool:
-    """Do all rounds of a part's stage, within its limits; return whether an answer stands out."""
-    stage = part.stage
-    while part.stage == stage and not part.ended:
-        before = part.score
-        part.advance(budget)
-        part.stopped = budget.spent
-        if part.stopped:
-            break
-        if part.score > before and part.score >= options.accept and proves(part):
-            return True
-    return proves(part)
 
 
 Item = TypeVar("Item")
