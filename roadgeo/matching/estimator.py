@@ -63,9 +63,10 @@ _LEAST_SHARE_BY_ROADS = 0.2
 #: accepted; and how.
 _N_EQUALS, _OWN_TUPLES = 6, TripleOptions()
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
-#: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis, and comparing a
-#: hypothesis with the map, plus the time for each road point.
-_ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _VERIFIED_S, _VERIFIED_POINT_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 1e-3, 3.5e-6
+#: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
+#: by roads, and comparing a hypothesis with the map, plus the time for each road point.
+_ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _BY_ROADS_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 0.1e-3
+_VERIFIED_S, _VERIFIED_POINT_S = 1e-3, 3.5e-6
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class TripleEstimator:
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
-        self._n_rounds, self._anchors = 0, set[int]()
+        self._n_rounds, self._n_by_roads, self._anchors = 0, 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
         self.in_company = False  # whether it is searched with others first, by the first sweep, and then alone
@@ -159,8 +160,8 @@ class TripleEstimator:
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
-        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do where units
-        are searched alone, too, for the rarest triples of all have been looked up on all of them together.
+        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do, too, where
+        units are searched alone: the sweeps were done on all of them together.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
@@ -174,7 +175,7 @@ class TripleEstimator:
             yield from sweeps
             return
         roads = [self._rounds_of_roads()]
-        roads_first = self.index.coarseness > 1.0 or self.sweeps.alone
+        roads_first = self.sweeps.alone or self.index.coarseness > 1.0
         yield from roads + sweeps if roads_first else sweeps + roads
 
     @property
@@ -182,7 +183,8 @@ class TripleEstimator:
         """Seconds that a usual machine takes for the work done (see `search.Estimator`), on one core."""
         verified_s = _VERIFIED_S + _VERIFIED_POINT_S * len(self.scene.dense_points)
         tried_s = _ROUND_S * self._n_rounds + _TUPLE_S * self.n_candidates + _PLACE_S * self.n_screened
-        return tried_s + _GROWN_S * self.n_hypotheses + verified_s * self.n_verified
+        by_roads_s = (_BY_ROADS_S - _GROWN_S) * self._n_by_roads
+        return tried_s + _GROWN_S * self.n_hypotheses + by_roads_s + verified_s * self.n_verified
 
     @property
     def n_anchors(self) -> int:
@@ -202,6 +204,7 @@ class TripleEstimator:
             for anchor, n_tried, n_proposed, grown in rounds:
                 self._count(n_tried)
                 self.n_hypotheses += n_proposed
+                self._n_by_roads += n_proposed
                 self._look_for(anchor)
                 self.events.note("voted", anchor, n_proposed)
                 for place in grown:
