@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import pytest
 from worlds.scenes import search
 
-from roadgeo.matching.search import Search, SearchOptions, search_in_turn, search_together
+from roadgeo.matching.search import Search, SearchOptions, search_together
 
 
 @dataclass
@@ -155,36 +155,17 @@ def test_many_parts_share_one_time_limit():
 # --- each part as if it were alone ------------------------------------------------------------------------------------
 
 
-def in_turn(*toys, options=None, proves=lambda part: part.score >= 8.0):
-    parts = [Search(toy) for toy in toys]
-    search_in_turn(parts, [options or SearchOptions()] * len(parts), proves)
-    return parts
-
-
-def test_stages_of_all_parts_follow_each_other_until_an_answer_stands_out_on_its_own_part():
+def test_parts_take_turns_until_one_stands_out_on_its_own():
     toys = [InStages([[(10 * n + k, 1.0)] for k in range(3)]) for n in range(3)]
     toys[1].plan[1] = [(17, 9.0)]
     toys[2].plan[0] = [(20, 7.9)]  # does not lead its own part, and is no rival
-    parts = in_turn(*toys)
-    assert [len(toy.scored) for toy in toys] == [2, 2, 1]
+    parts = [Search(toy) for toy in toys]
+    search_together(parts, proves=lambda parts: next((part for part in parts if part.score >= 8.0), None))
+    assert [len(toy.scored) for toy in toys] == [2, 2, 2]
     assert [part.stopped for part in parts] == ["elsewhere", "accepted", "elsewhere"]
-
-
-def test_an_answer_ends_the_search_within_a_stage():
-    toys = [Toy([[(k, float(k))] for k in range(20)]), Toy([[(50, 1.0)]])]
-    parts = in_turn(*toys)
-    assert (toys[0].scored, toys[1].scored) == (list(range(9)), [])
-    assert [part.stopped for part in parts] == ["accepted", "elsewhere"]
-
-
-def test_each_part_has_limits_of_its_own_and_what_ends_early_leaves_its_work_to_no_other():
-    toys = [Toy([[(k, 1.0)] for k in range(30)]), Toy([[(50, 1.0)]]), Toy([[(k, 1.0)] for k in range(30)])]
-    parts = in_turn(*toys, options=SearchOptions(work_limit_s=10.0))
-    assert [len(toy.scored) for toy in toys] == [10, 1, 10]
-    assert [part.stopped for part in parts] == ["work", "exhausted", "work"]
 
 
 def test_work_that_was_done_together_is_not_charged_again():
     toy = Toy([[(k, 1.0)] for k in range(30)], scored=list(range(100)))
-    in_turn(toy, options=SearchOptions(work_limit_s=10.0))
+    together(toy, options=SearchOptions(work_limit_s=10.0))
     assert len(toy.scored) == 110
