@@ -23,6 +23,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
+from roadgeo.matching.veto import contest
 from roadgeo.reference.reference import Reference
 
 __all__ = ["Candidates", "MosaicQuery"]
@@ -105,6 +106,7 @@ class Candidates:
 
     def _search(self, frames: MosaicQuery, options: LocateOptions) -> Location:
         """Search the map where that is due; places that were proposed before are among those that the search meets."""
+        hinted = options
         if not frames.searched:
             options = replace(options, match=replace(options.match, sweeps=(), without_roads=(), roads=False))
         proposed: list[Proposed] = [
@@ -117,7 +119,9 @@ class Candidates:
         kept = [candidate for result in results for candidate in _proposed(result, frames)]
         self._kept = sorted(kept, key=lambda kept: -kept.log10_likelihood)[:MOST]
         paid = math.log10(max(self.n_searches, 1))  # each search may find a place by chance
-        return decide(frames.query, [result.less_likely(paid) for result in results], options)
+        results = [result.less_likely(paid) for result in results]
+        contested = contest(frames.query, results, parts, hinted, options.search.time_limit_s)
+        return decide(frames.query, contested, options)
 
 
 def _proposed(searched: Searched, frames: MosaicQuery) -> Iterable[_Candidate]:

@@ -48,13 +48,14 @@ _LEAST_SHARE = 0.6
 #: Frames in no order are laid on each other where they share this part: less agrees by chance.
 _LEAST_SHARED = 0.3
 #: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before,
-#: and the score of a motion that differs is reduced by this much, per frame's side.
+#: and the score of a motion that differs is reduced by this much, per frame's side; unless a jump fits clearly better.
 _STEADY, _OTHERWISE = 0.1, 1.28
-#: How well a motion must fit (see `_Laid`), where the frame's before is known, and where it is not; by how much
-#: it must then lead any other.
+#: How well a motion must fit (see `_Alignment`) that goes on as the frame's before, and how well any other; by how much
+#: it must then lead all others.
 _LEAST_AGAIN, _LEAST_FIRST, _LEAD_FIRST = 0.3, 0.55, 0.06
-#: How far off a corner may be put by masks, and by taking the flight to go on as it went; and how often in a row it is.
-_MASKS_PX, _HELD_PX, _MOST_HELD = 12.0, 30.0, 2
+#: How far off a corner may be put by masks, by masks that are equal, and by taking the flight to go on as it went; and
+#: how often in a row it is.
+_MASKS_PX, _STILL_PX, _HELD_PX, _MOST_HELD = 12.0, 1.0, 30.0, 2
 _FILTER = FilterOptions(
     sigma_m=2.0,
     sigma_px=1.0,
@@ -126,7 +127,10 @@ def _half_turn(frame: Frame) -> FloatArray:
 
 @dataclass
 class Odometer:
-    """Estimates how each mask of a flight moved; where masks do not show it, it goes on as it went, a frame or two."""
+    """Estimates how each mask of a flight moved; where masks do not show it, it goes on as it went, a frame or two.
+
+    A mask that equals the one before did not move: the link stood still, and the flight goes on after it.
+    """
 
     _traced: TracedMask | None = None
     _motion: FloatArray | None = None
@@ -141,6 +145,8 @@ class Odometer:
         float
             Standard deviation of a corner, pixels.
         """
+        if mask.roads.any() and np.array_equal(before.roads, mask.roads):
+            return np.eye(3), _STILL_PX
         previous = self._traced if self._traced is not None and self._traced.mask is before else TracedMask.of(before)
         self._traced = TracedMask.of(mask)
         motion = (
@@ -186,35 +192,37 @@ def between_masks(first: TracedMask, other: TracedMask, last: FloatArray | None 
     Parameters
     ----------
     last : (3, 3) float64, optional
-        The motion of the frame before: flights go on as they went.
+        The motion of the frame before: flights go on as they went, unless the roads clearly show another motion.
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    guesses = _rough_motions(first.mask, other.mask, 2 * len(_TURNS_DEG))
-    if last is not None:
-        guesses = [last, *(guess for guess in guesses if _otherwise(guess, last, frame) < 2.0 * _STEADY)]
+    guesses = [*([] if last is None else [last]), *_rough_motions(first.mask, other.mask, 2 * len(_TURNS_DEG))]
     alignments = [alignment for guess in guesses if (alignment := _lay(guess, frame, first, other)) is not None]
-    return _surest(alignments, frame) if last is None else _steadiest(alignments, last, frame)
+    steady = None if last is None else _steadiest(alignments, last, frame)
+    if steady is not None and all(steady.rivals(other) for other in alignments):
+        return steady.motion
+    surest = _surest(alignments, frame)
+    return None if surest is None else surest.motion
 
 
-def _surest(alignments: Sequence[_Alignment], frame: Frame) -> FloatArray | None:
-    """Return the motion that fits best; None where that is little, or another one fits as well."""
+def _surest(alignments: Sequence[_Alignment], frame: Frame) -> _Alignment | None:
+    """Return the alignment that fits best; None where that is little, or another one fits as well."""
     best = max(alignments, key=lambda alignment: alignment.fit, default=None)
     if best is None or best.fit < _LEAST_FIRST:
         return None
-    others = (alignment for alignment in alignments if not _is_same_motion(alignment.motion, best.motion, frame))
-    return None if any(alignment.rivals(best) for alignment in others) else best.motion
+    others = (other for other in alignments if not _is_same_motion(other.motion, best.motion, frame))
+    return None if any(other.rivals(best) for other in others) else best
 
 
-def _steadiest(alignments: Sequence[_Alignment], last: FloatArray, frame: Frame) -> FloatArray | None:
-    """Return the motion that fits best, and goes on as the one before; None where that is little."""
-    rated = [
+def _steadiest(alignments: Sequence[_Alignment], last: FloatArray, frame: Frame) -> _Alignment | None:
+    """Return the alignment that fits best, and goes on as the motion before; None where that is little."""
+    ranked = [
         (alignment.fit - _OTHERWISE * off, alignment)
         for alignment in alignments
         if (off := _otherwise(alignment.motion, last, frame)) < _STEADY
     ]
-    fit, best = max(rated, key=lambda pair: pair[0], default=(0.0, None))
-    return best.motion if best is not None and fit >= _LEAST_AGAIN else None
+    fit, best = max(ranked, key=lambda pair: pair[0], default=(0.0, None))
+    return best if fit >= _LEAST_AGAIN else None
 
 
 def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) -> _Alignment | None:

@@ -17,11 +17,11 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.flights.mosaic import lay_down, road_px
 from roadgeo.flights.motion import TracedMask, between_images, overlay
-from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
+from roadgeo.flights.tracker import AROUND, FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.matching.checking import CheckOptions, check_place
+from roadgeo.matching.checking import check_place
 from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
@@ -147,12 +147,8 @@ class _Net:
             return False
         query = read_query(tracked.frame.mask)
         start = tracked.pose.homography.matrix @ PIXEL_TO_PLANE
-        checked = check_place(start / start[2, 2], query, tracked.reference.index, _CHECK, beyond=False)
+        checked = check_place(start / start[2, 2], query, tracked.reference.index, AROUND, beyond=False)
         return checked.verdict == "agrees"
-
-
-#: A frame is where it was put, as against a block beside.
-_CHECK = CheckOptions(tolerance_m=20.0, max_sigma_m=10.0)
 
 
 def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) -> list[Link]:

@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+import shapely
+from shapely import affinity
 
 from roadgeo.flights.candidates import Candidates, MosaicQuery
 from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.location import Reason
+from roadgeo.matching.index import build_index
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.network import build_network
 
 
 def mosaic_of(flown, count, searched):
@@ -78,3 +85,21 @@ def test_places_whose_frames_left_the_view_are_forgotten(flown):
     location = candidates.decide(gone, LocateOptions())
     assert not location.located
     assert len(candidates) == 0
+
+
+@pytest.fixture(scope="module")
+def twice(flown):
+    """The town, and six kilometres east what it was before it grew; a circle around where the frames would lie there."""
+    flight, _, reference = flown
+    plane, lines = reference.index.plane, [shapely.LineString(line) for line in reference.network.graph.polylines()]
+    before = [affinity.translate(line, 6000.0) for k, line in enumerate(lines) if k % 5]
+    network = build_network(lines + before, plane, {"name": "twice"})
+    middle = flight.views[2].homography(np.array([200.0, 150.0])) + np.array([6000.0, 0.0])
+    lon, lat = to_lonlat(plane.crs, plane.to_crs(middle[None]))[0].tolist()
+    return Reference(build_index(network), network), (lon, lat, 200.0)
+
+
+def test_a_false_circle_is_refuted_where_the_roads_fit_better(flown, twice):
+    reference, near = twice
+    location = Candidates([reference]).decide(mosaic_of(flown, 6, True), LocateOptions(near=near))
+    assert location.reason_code is Reason.FITS_ELSEWHERE, location.reason
