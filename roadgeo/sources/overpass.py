@@ -1,7 +1,8 @@
 """Roads of an area from OpenStreetMap's servers, asked by osmnx: Nominatim finds the place, Overpass gives its roads.
 
 Osmnx keeps their limits, waits while they are busy, and keeps each answer as a file; here these are read as files of
-Overpass are. Osmnx is imported only here and late: it takes longer than to open a reference.
+Overpass are. Its graph of them, asked for all roads, holds the same ones at twice the cost (docs/references.md). Osmnx
+is imported only here and late: it takes longer than to open a reference.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import re
 import shutil
 import socket
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Iterator
@@ -40,6 +42,8 @@ __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area",
 
 _LOG = logging.getLogger(__name__)
 
+#: Osmnx's settings, and the way to resolve names that it replaces, are those of the process.
+_ONE_AT_A_TIME = threading.Lock()
 _BUSY = (429, 504)  # osmnx waits a minute, and asks again without end
 _MOST_TRIES = 5
 _MOST_AGE_S = 30 * 86400.0
@@ -209,9 +213,13 @@ def _asking(url: str, options: FetchOptions, say: Say, question: str) -> Iterato
     import requests
 
     host = urlsplit(url).netloc
-    before = {name: value for name, value in vars(osmnx.settings).items() if not name.startswith("_")}
-    resolve = socket.getaddrinfo  # osmnx replaces it
-    with _folder(f"{url} {options.date} {question}", options.cache) as folder, warnings.catch_warnings():
+    with (
+        _ONE_AT_A_TIME,
+        _folder(f"{url} {options.date} {question}", options.cache) as folder,
+        warnings.catch_warnings(),
+    ):
+        before = {name: value for name, value in vars(osmnx.settings).items() if not name.startswith("_")}
+        resolve = socket.getaddrinfo  # osmnx replaces it
         warnings.simplefilter("ignore", UserWarning)  # that a large area takes long: `say` shows that
         was_asked = any(folder.iterdir())
         if not was_asked:

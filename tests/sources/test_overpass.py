@@ -1,6 +1,7 @@
 import os
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -146,6 +147,18 @@ def test_nothing_of_osmnx_is_changed_for_the_rest_of_a_program(osm, pauses):
     fetch_roads("Fenway, Boston", options=ask(osm))
     assert dict(vars(osmnx.settings)) == before
     assert socket.getaddrinfo is resolve
+
+
+def test_threads_ask_their_own_servers(osm, pauses):
+    """Osmnx's settings are those of the process."""
+    import osmnx
+
+    before = dict(vars(osmnx.settings))
+    with fake_osm() as other, ThreadPoolExecutor(2) as pool:
+        asked = [pool.submit(fetch_roads, "Fenway, Boston", options=ask(one, cache=False)) for one in [osm, other] * 3]
+        assert len({len(one.result()) for one in asked}) == 1
+    assert len(osm.queries) == len(other.queries) == 3
+    assert dict(vars(osmnx.settings)) == before
 
 
 @pytest.mark.parametrize(
