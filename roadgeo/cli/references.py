@@ -205,10 +205,6 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
         lines.append(("density", f"{described['intersections_per_km2']:.0f} intersections per km²"))
     if described.get("memory_bytes"):
         lines.append(("memory", f"{described['memory_bytes'] / 1e6:.1f} MB, mapped"))
-    types = described.get("tuple_types", {}).get("types", [])
-    if types:
-        commonest = ", ".join(f"{entry['d_b']} {entry['tuples']:,}" for entry in types[:4])
-        lines.append(("tuple types", f"{len(types)}, the commonest: {commonest}"))
     texts = {key: value for key, value in meta.items() if isinstance(value, str) and key != "name"}
     if "roads" in texts:
         texts["roads"] = _kinds_text(texts["roads"], meta.get("sources") or [])

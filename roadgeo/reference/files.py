@@ -31,7 +31,6 @@ from roadgeo.reference.network_file import (
     stored_digest,
     write_network,
 )
-from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.files import remove_leftovers, replacing
 
@@ -57,9 +56,6 @@ Identities: TypeAlias = list[tuple[int, int] | None]
 #: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage
 #: from which to build it again.
 Freshness: TypeAlias = Literal["fresh", "stale", "no index", "old format", "no GeoPackage"]
-
-#: Largest distance between the intersections of a tuple whose types are counted, as in the paper's Figure 7 (eq. 8).
-TUPLE_DISTANCE_M = 500.0
 
 #: Seconds after which a stale index is one: until then a writer may be about to replace it.
 _PATIENCE_S = 0.5
@@ -282,23 +278,6 @@ def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
         "road_km": float(graph.edge_lengths().sum()) / 1e3,
         "area_km2": area_km2,
         "intersections_per_km2": len(detected) / area_km2 if area_km2 else None,
-        "tuple_types": _count_tuple_types(detected, TUPLE_DISTANCE_M),
         "index": {key: value for key, value in meta.items() if key not in network.meta},
         "meta": network.meta,
     }
-
-
-def _count_tuple_types(detected: Intersections, d_max: float) -> dict[str, Any]:
-    """Count pairs of intersections within `d_max` (eq. 8) by branch descriptor d_b, the commonest first (Figure 7)."""
-    from scipy.spatial import KDTree
-
-    types, member = np.unique(np.column_stack([detected.n_branches, detected.n_tangents]), axis=0, return_inverse=True)
-    trees = [KDTree(detected.xy[member.ravel() == i]) for i in range(len(types))]
-    counts = []
-    for i, (b1, q1) in enumerate(types.tolist()):
-        for j, (b2, q2) in enumerate(types[: i + 1].tolist()):
-            n = int(trees[i].count_neighbors(trees[j], d_max))
-            pairs = (n - trees[i].n) // 2 if i == j else n
-            if pairs:
-                counts.append({"d_b": [b1, b2, q1, q2], "tuples": pairs})
-    return {"d_max_m": d_max, "types": sorted(counts, key=lambda entry: -entry["tuples"])}

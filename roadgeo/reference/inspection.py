@@ -35,9 +35,8 @@ def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
     dict
         `name`, `freshness`, `files` (sizes in bytes by path), `crs`, `counts`, `meta` (the network's own); with an
         index also its `format`, `roadgeo` (the version that built it), `memory_bytes` (of the mapped arrays), `extent`
-        (min easting, min northing, max easting, max northing), `road_km`, `area_km2`, `intersections_per_km2`,
-        `tuple_types` (the paper's Figure 7) and `index` (its options and grid); with shards `extent_lonlat` and
-        `shards`.
+        (min easting, min northing, max easting, max northing), `road_km`, `area_km2`, `intersections_per_km2`
+        and `index` (its options and grid); with shards `extent_lonlat` and `shards`.
 
     Raises
     ------

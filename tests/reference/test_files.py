@@ -401,22 +401,6 @@ def test_description(path: Path, network: RoadNetwork, monkeypatch: pytest.Monke
     assert (high <= np.array(network.plane.origin) + 700).all()
 
 
-def test_tuple_types_are_those_of_all_pairs(path: Path, network: RoadNetwork) -> None:
-    """The paper's Figure 7, by going through all pairs."""
-    found, counts = network.intersections, dict[tuple[int, ...], int]()
-    kinds = list(zip(found.n_branches.tolist(), found.n_tangents.tolist(), strict=True))
-    for i in range(len(found)):
-        for j in range(i):
-            if np.hypot(*(found.xy[i] - found.xy[j])) <= 500:
-                (b1, q1), (b2, q2) = sorted([kinds[i], kinds[j]], reverse=True)
-                counts[b1, b2, q1, q2] = counts.get((b1, b2, q1, q2), 0) + 1
-    described = describe_reference(path)["tuple_types"]
-    assert described["d_max_m"] == 500
-    assert {tuple(entry["d_b"]): entry["tuples"] for entry in described["types"]} == counts
-    numbers = [entry["tuples"] for entry in described["types"]]
-    assert numbers == sorted(numbers, reverse=True)
-
-
 def test_description_without_an_index(path: Path, network: RoadNetwork) -> None:
     path.with_suffix(".index").unlink()
     found = describe_reference(path)
