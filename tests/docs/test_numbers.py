@@ -9,7 +9,7 @@ from support.documents import ROOT
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.kernels.road_rings import BEARINGS, RINGS
 from roadgeo.location import ERROR_RATES
-from roadgeo.matching import evidence, picture, rivals, triples
+from roadgeo.matching import evidence, picture, rivals, triples, verdict, veto
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper import PairOptions
 from roadgeo.matching.search import SearchOptions
@@ -41,6 +41,8 @@ FROM_CODE = [
     (SECTION_8, r"and (half) of the lesser one", rivals._AGREEING),
     (SECTION_8, r"or the blocks beside it, by 10\^(\d+) is", rivals._CERTAIN),
     (SECTION_8, r"met is less than (half) of the score needed", rivals._MAY_LEAD),
+    (SECTION_8, r"by traced roads and by 10\^([\d.]+),", veto._MORE),
+    (SECTION_8, r"Two places agree with (\d+) % of the roads", round(100 * verdict._LIKE_THE_TRUTH)),
     (SECTION_8, r"A lead of 10\^([\d.]+) or more", NEEDED),
     ("docs/faq.md", r"A place is reported from ([\d.]+) on", NEEDED),
     ("docs/faq.md", r"a quarter turn, within (\d+) km", rivals._AROUND.reach_m / 1000.0),
