@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import OutputError
-from roadgeo.storage.files import make_folder, stage, writing
+from roadgeo.storage.files import make_folder, make_temporary_folder, stage
 from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, user_dir, writable
 
 __all__ = ["Fence", "abi_version", "current", "is_inside", "is_started_inside", "remedy"]
@@ -267,8 +267,7 @@ def _stems(name: str) -> set[str]:
 
 def _make_temporary_folder(where: str) -> None:
     """Make a folder for temporary files, of this process and of the ones that it starts."""
-    with writing(where):
-        folder = tempfile.mkdtemp(prefix="roadgeo-", dir=where)
+    folder = str(make_temporary_folder(Path(where)))
     from multiprocessing.util import Finalize
 
     # Later than those that other modules make, and then remove, within it; not by processes that are forked off.

@@ -27,8 +27,8 @@ except ImportError:  # Windows: there an open file cannot be deleted, which serv
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
-    "make_folder", "remove_leftovers", "remove_own", "replacing", "stage", "sync_file", "write_bytes", "write_text",
-    "writing",
+    "make_folder", "make_temporary_folder", "remove_leftovers", "remove_own", "replacing", "stage", "sync_file",
+    "write_bytes", "write_text", "writing",
 ]  # fmt: skip
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
@@ -213,6 +213,21 @@ def stage(parent: Path) -> Path:
     return folder
 
 
+def make_temporary_folder(parent: Path) -> Path:
+    """Make a folder for temporary files of this process; where it is killed, the next one removes it.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made.
+    """
+    remove_leftovers(parent)
+    with writing(parent):
+        folder, lock = _make_folder(parent)
+    _held.append(lock)
+    return folder
+
+
 @atexit.register
 def remove_own() -> None:
     """Remove the staging folders of a process that ends: an interrupt may have come while one was made or removed."""
@@ -244,9 +259,9 @@ def _make_folder(parent: Path, name: str = "") -> tuple[Path, BinaryIO]:
 
 
 def remove_leftovers(parent: Path) -> None:
-    """Remove staging folders of dead writers: their lock is free."""
+    """Remove this user's staging folders of dead writers: their lock is free."""
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
-        if not re.fullmatch(_NAME, folder.name):
+        if not re.fullmatch(_NAME, folder.name) or not _is_own(folder):
             continue
         with contextlib.suppress(OSError):  # in use, or being removed by somebody else
             if not (folder / _LOCK).exists():
@@ -259,6 +274,12 @@ def remove_leftovers(parent: Path) -> None:
             with open(folder / _LOCK, "rb+", opener=_follow_no_link) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_own(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return os.name != "posix" or folder.lstat().st_uid == os.getuid()
+    return False
 
 
 _remove_leftovers_once = lru_cache(maxsize=64)(remove_leftovers)

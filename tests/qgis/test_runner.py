@@ -12,30 +12,36 @@ from roadgeo.qgis.plugin import runner
 # --- finding programs -------------------------------------------------------------------------------------------------
 
 
-def test_the_executable_is_searched_from_the_surest_place_to_the_usual_ones(tmp_path: Path) -> None:
-    home, beside = tmp_path / "home", tmp_path / "plugin"
+def test_the_executable_is_what_the_user_chose(tmp_path: Path) -> None:
+    beside = tmp_path / "plugin"
     beside.mkdir()
     places = [
-        home / "miniforge3" / "envs" / "maps" / "bin" / "roadgeo",
-        home / ".local" / "bin" / "roadgeo",
         tmp_path / "path" / "roadgeo",
         tmp_path / "remembered" / "roadgeo",
         tmp_path / "named" / "roadgeo",
     ]
-    environ = {"PATH": str(places[2].parent), "ROADGEO_EXECUTABLE": str(places[4])}
-    (beside / runner.REMEMBERED).write_text(f"{places[3]}\n", "utf-8")
-    assert runner.find_executable("", environ, home, beside) is None
+    environ = {"PATH": str(places[0].parent), "ROADGEO_EXECUTABLE": str(places[2])}
+    (beside / runner.REMEMBERED).write_text(f"{places[1]}\n", "utf-8")
+    assert runner.find_executable("", environ, beside) is None
     for place in places:  # each takes precedence over those before it
         make_program(place, "")
-        assert runner.find_executable("", environ, home, beside) == str(place)
-    assert runner.find_executable(str(places[0]), environ, home, beside) == str(places[0])
-    assert runner.find_executable(str(tmp_path / "none"), environ, home, beside) is None
+        assert runner.find_executable("", environ, beside) == str(place)
+    assert runner.find_executable(str(places[0]), environ, beside) == str(places[0])
+    assert runner.find_executable(str(tmp_path / "none"), environ, beside) is None
+
+
+@pytest.mark.parametrize("folder", ["miniforge3/envs/maps", ".local", ".venv", "pipx/venvs/roadgeo"])
+def test_what_lies_in_the_home_folder_is_proposed_and_not_started(folder: str, tmp_path: Path) -> None:
+    assert not runner.find_below(tmp_path)
+    program = make_program(tmp_path / folder / "bin" / "roadgeo", "")
+    assert runner.find_below(tmp_path) == str(program)
+    assert runner.find_executable("", {"PATH": "", "HOME": str(tmp_path)}, tmp_path) is None
 
 
 @pytest.mark.parametrize("folder", ["archive/.venv", "evil-conda/envs/a", "my-forge/envs/a", "Downloads/a/.venv"])
-def test_what_was_unpacked_in_the_home_folder_is_never_started(folder: str, tmp_path: Path) -> None:
+def test_what_was_unpacked_in_the_home_folder_is_not_proposed(folder: str, tmp_path: Path) -> None:
     make_program(tmp_path / folder / "bin" / "roadgeo", "")
-    assert runner.find_executable("", {"PATH": ""}, tmp_path, tmp_path) is None
+    assert not runner.find_below(tmp_path)
 
 
 @pytest.mark.parametrize("path", ["", ".", "bin:", "{here}", "{here}/../{name}"])
@@ -48,8 +54,8 @@ def test_programs_of_the_current_folder_are_never_started(
         make_program(tmp_path / name, "")
     monkeypatch.chdir(tmp_path)
     environ = {"PATH": path.format(here=tmp_path, name=tmp_path.name)}
-    assert runner.find_executable("", environ, tmp_path / "home", tmp_path / "plugin") is None
-    assert runner.find_executable("roadgeo", environ, tmp_path / "home", tmp_path / "plugin") is None
+    assert runner.find_executable("", environ, tmp_path / "plugin") is None
+    assert runner.find_executable("roadgeo", environ, tmp_path / "plugin") is None
     assert not [found for found in runner.find_pythons(environ, tmp_path / "home") if str(tmp_path) in found]
 
 

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 import textwrap
 from pathlib import Path
 
@@ -145,6 +146,20 @@ def test_earlier_versions_will_do(abi: int, desk: Path) -> None:
     assert said == "True False"
     assert (desk / "result.txt").read_text() == "whole"
     assert not list(desk.glob(".roadgeo*"))
+
+
+def test_temporary_files_of_a_process_that_was_killed_go_with_the_next(desk: Path) -> None:
+    temporary = Path(tempfile.mkdtemp(dir=desk.parent))
+    other = temporary / ".roadgeo-0123456789ab.tmp"
+    other.mkdir()
+    (other / "lock").touch()
+    here = f"import tempfile; tempfile.tempdir = {str(temporary)!r}; Fence((), ('.',)).enter()"
+    with pytest.raises(AssertionError, match="-9 == 0"):
+        fenced(desk, f"{here}; Path(tempfile.gettempdir(), 'left').touch(); os.kill(os.getpid(), 9)")
+    assert len(list(temporary.glob("*/left"))) == 1
+    assert not other.exists()
+    assert not fenced(desk, here)
+    assert not list(temporary.iterdir())
 
 
 def test_a_cache_that_cannot_be_used_is_replaced_by_one_that_is_found_again(desk: Path) -> None:

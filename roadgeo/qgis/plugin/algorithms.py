@@ -28,7 +28,14 @@ from .library import list_places, list_references
 from .parameters import Option, Values
 from .runner import find_program
 from .session import PICTURE_KEPT, POINTS_KEPT, Finding, LayerGroup, Session
-from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
+from .settings import (
+    NOT_FOUND,
+    configure,
+    locate_executable,
+    propose_executable,
+    remember_reference,
+    remembered_references,
+)
 
 __all__ = ["ALGORITHMS"]
 
@@ -366,7 +373,9 @@ class SetUp(RoadgeoAlgorithm):
         else:
             result = program or locate_executable() or ""
         if not result:
-            advice = f"To install it, tick “{given.SETUP[1].label}”, or name it above."
+            advice = f"To install it, tick “{given.SETUP[1].label}”, or name it above"
+            proposed = propose_executable()
+            advice += f": there is {proposed}, if that is yours." if proposed else "."
             raise QgsProcessingException(f"The program roadgeo was not found on this computer. {advice}")
         self.program = {"FOUND": result, "VERSION": ask_version(result, session)}
         return self.program

@@ -12,7 +12,7 @@ from qgis.PyQt.QtGui import QDesktopServices, QIcon
 from qgis.PyQt.QtWidgets import QMenu, QToolButton
 
 from .dock import MatchDock
-from .settings import locate_executable
+from .settings import locate_executable, propose_executable
 from .window import open_dialog, push
 
 __all__ = ["Menu"]
@@ -68,8 +68,13 @@ class Menu:
         return open_dialog(algorithm, parameters) if locate_executable() else self.set_up()
 
     def set_up(self) -> Any:
-        """Open the dialog that finds or, where it is not there, installs the program."""
-        return open_dialog("setup", {"INSTALL": locate_executable() is None})
+        """Open the dialog that finds or, where it is not there, installs the program.
+
+        One in the home folder is named there, and starts only when the dialog is run.
+        """
+        proposed = "" if locate_executable() else propose_executable()
+        named = {"PROGRAM": proposed} if proposed else {}
+        return open_dialog("setup", {"INSTALL": not (proposed or locate_executable()), **named})
 
     def ask_to_set_up(self) -> None:
         """Ask in the message bar, until it is done."""

@@ -22,6 +22,7 @@ __all__ = [
     "REMEMBERED",
     "as_command",
     "child_environment",
+    "find_below",
     "find_executable",
     "find_program",
     "find_pythons",
@@ -66,22 +67,30 @@ _NOT_INHERITED = ("PYTHON", "__PYVENV", "PROJ_", "GDAL_")
 _GRACE_S, _LOOK_S = 3.0, 0.1
 
 
-def find_executable(configured: str, environ: Mapping[str, str], home: Path, beside: Path) -> str | None:
-    """Find the roadgeo executable, or return None.
+def find_executable(configured: str, environ: Mapping[str, str], beside: Path) -> str | None:
+    """Find the roadgeo executable that the user chose, or return None.
 
     Parameters
     ----------
     configured : str
         Path from the settings; "" searches: ROADGEO_EXECUTABLE, the path that the installer left in the folder
-        `beside`, PATH, and the usual places below `home`.
+        `beside`, and PATH.
     """
     if configured:
         return find_program(configured, environ)
     remembered = beside / REMEMBERED
     names = [environ.get("ROADGEO_EXECUTABLE", ""), remembered.read_text("utf-8") if remembered.is_file() else ""]
-    names += [_NAME, *(str(place / _NAME) for pattern in _PLACES for place in sorted(home.glob(pattern)))]
-    programs = (find_program(name.strip(), environ) for name in names if name.strip())
+    programs = (find_program(name.strip(), environ) for name in [*names, _NAME] if name.strip())
     return next(filter(None, programs), None)
+
+
+def find_below(home: Path) -> str:
+    """Return an executable in a usual place below the home folder, which the user is to be asked for; "" without one.
+
+    Anybody's archive may have been unpacked there.
+    """
+    places = (place / _NAME for pattern in _PLACES for place in sorted(home.glob(pattern)))
+    return next((str(program) for program in places if _is_executable(program)), "")
 
 
 def find_pythons(environ: Mapping[str, str], home: Path) -> list[str]:

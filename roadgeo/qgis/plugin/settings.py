@@ -9,7 +9,7 @@ from typing import Any
 from processing.core.ProcessingConfig import ProcessingConfig, Setting
 from qgis.core import QgsSettings
 
-from .runner import as_command, find_executable
+from .runner import as_command, find_below, find_executable
 
 __all__ = [
     "NOT_FOUND",
@@ -17,6 +17,7 @@ __all__ = [
     "configure",
     "locate_command",
     "locate_executable",
+    "propose_executable",
     "remember_reference",
     "remembered_references",
     "remove_settings",
@@ -54,7 +55,12 @@ def configure(path: str) -> None:
 def locate_executable() -> str | None:
     """Return the path of the program, or of a Python that has it, or None."""
     configured = str(ProcessingConfig.getSetting(_EXECUTABLE) or "")
-    return find_executable(configured, os.environ, Path.home(), Path(__file__).parent)
+    return find_executable(configured, os.environ, Path(__file__).parent)
+
+
+def propose_executable() -> str:
+    """Return the path of a program in the home folder, which the user is to be asked for before it starts; or ""."""
+    return find_below(Path.home())
 
 
 def locate_command() -> list[str] | None:
