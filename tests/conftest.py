@@ -36,6 +36,7 @@ NIGHTLY = (
     "tests/qgis/",
     "tests/running/test_cluster.py",
     "tests/running/test_divided.py",
+    "tests/serving/test_workers.py::test_neither_processes",
     "tests/test_endurance.py",
 )
 DAILY = ("tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/tutorial.md]",)

@@ -17,11 +17,13 @@ from roadgeo.matching.evidence import Evidence, _anyhow, _log_ratios, statement_
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.picture import Picture
 from roadgeo.matching.place import Place
+from roadgeo.matching.refinement import Refined
 from roadgeo.matching.rivals import Rivals, log10_gap
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about, shifted
 
-TRUTH = camera((2000, 2000), (1200, 900), 1.0, 20.0, 10.0, 0.0)
+SIZE = (900, 700)
+TRUTH = camera((2000, 2000), SIZE, 1.0, 20.0, 10.0, 0.0)
 
 
 # --- likelihoods ------------------------------------------------------------------------------------------------------
@@ -49,18 +51,18 @@ def test_roads_by_chance_are_powers_of_four_fifths():
 @pytest.fixture(scope="module")
 def view(town):
     """A view of the town, where a tenth of the roads are false and three tenths missing, and what weighs places."""
-    scene = scene_of(look(town[0], TRUTH, (1200, 900), Sight(1.5, 0.3, 0.1)), (1200, 900))
+    scene = scene_of(look(town[0], TRUTH, SIZE, Sight(1.5, 0.3, 0.1)), SIZE)
     return Evidence(scene, town[1], 1.0)
 
 
 def test_places_of_a_town_weigh_what_they_did(view):
     beside = shifted(TRUTH, 7.0, 4.0)
     middle = Homography(TRUTH)(view.scene.center)
-    turned = move_about(middle, Shift(0.0, 0.0, 4.0, 1.0, 0.0)) @ TRUTH
+    turned = move_about(middle, Shift(0.0, 0.0, 1.5, 1.0, 0.0)) @ TRUTH
     weighed = [view.weigh(TRUTH), view.weigh(beside), view.agreement(beside).forward, view.agreement(beside).backward]
     weighed += [view.nearby(TRUTH), *view.compared_with(TRUTH)(turned), view.contradicted(turned)]
     weighed += [view.shared(TRUTH, turned), view.mapped_px(TRUTH)]
-    kept = [56.623, 23.9357, 0.5433, 0.7062, -3.3847, 0.6937, 29.789, 0.3289, 0.9914, 14421.6]
+    kept = [34.6528, 14.2733, 0.5983, 0.7082, -2.0246, 11.7078, 18.4269, 0.1099, 1.0, 8269.075]
     assert weighed == pytest.approx(kept, rel=1e-3)
 
 
@@ -146,6 +148,22 @@ def test_streets_around_are_searched_where_half_of_the_lead_needed_is_there(latt
     assert bool(reached) is is_searched
 
 
+@pytest.mark.parametrize(
+    ("east_m", "shared", "is_rival"), [(15.0, 0.0, False), (30.0, 0.0, True), (30.0, 0.6, True), (30.0, 0.75, False)]
+)
+def test_another_place_lies_apart_and_meets_other_roads(lattice, monkeypatch, east_m, shared, is_rival):
+    """By 4 hundredths of half the frame's diagonal, 23 m here, and a third of its roads."""
+    truth, index, evidence = lattice
+    estimator = TripleEstimator(evidence.scene, index)
+    place, other = (scored(Place(evidence.scene, index, shifted(truth, east, 0.0)), 5.0) for east in (0.0, east_m))
+    vars(place).update(contradicted=0.0, refined=object())
+    monkeypatch.setattr(Evidence, "shared", lambda *_: shared)
+    monkeypatch.setattr(estimator, "nearby", lambda _: 0.0)
+    monkeypatch.setattr(rivals, "similar_places", lambda *_: [])
+    compared = Rivals({}, Ledger(n_reference=866), 3.5)._compare(estimator, place, [place, other])
+    assert (compared.rival is not None) is is_rival
+
+
 def test_the_picture_counts_a_statement_each_250_m_and_no_likelihood_beyond_10(view):
     soft = replace(view.scene, probability=np.zeros((2, 2), np.float32))
     assert [Picture(soft, view.index, gsd_m).statement_px for gsd_m in (1.0, 10.0)] == [250.0, 50.0]
@@ -167,6 +185,16 @@ def test_two_places_are_alike_where_both_agree_like_the_truth(agreeing, are_alik
 def test_a_place_is_half_known_where_its_middle_is_uncertain_by_3_hundredths_of_the_frame(along_m, is_half):
     error = SimpleNamespace(along_m=along_m, across_m=3.0, azimuth_deg=45.0)
     assert bool(verdict._only_half(SimpleNamespace(center_error=error, gsd_m=1.0, size=(1000, 1000)))) is is_half
+
+
+@pytest.mark.parametrize(("lost", "is_level"), [(0.015, True), (0.03, False)])
+def test_a_camera_looks_straight_down_where_that_loses_2_hundredths_of_the_roads(monkeypatch, lost, is_level):
+    level = SimpleNamespace(matrix=np.eye(3), corner_covariance=np.eye(8), doubt=0.0)
+    monkeypatch.setattr(verdict, "find_similarity", lambda *_: level)
+    place, levelled = (SimpleNamespace(agreement=SimpleNamespace(forward=forward)) for forward in (0.9, 0.9 - lost))
+    vars(place).update(refined=Refined(np.eye(3), 1.0, np.eye(8)), lens_k1=0.0, matrix=np.eye(3), at=lambda _: levelled)
+    vars(place).update(scene=SimpleNamespace(corners=None))
+    assert (verdict._level(place) is levelled) is is_level
 
 
 def test_a_score_of_3_5_is_needed():

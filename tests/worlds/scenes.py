@@ -1,6 +1,7 @@
 """Made-up road networks, and what a camera above them sees, with everything known; no mask is drawn."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -49,6 +50,7 @@ def random_lines(seed: int, side: float = 3000.0, spacing: float = 120.0) -> lis
     return lines
 
 
+@lru_cache(maxsize=16)
 def random_network(seed: int, side: float = 3000.0, spacing: float = 120.0) -> RoadNetwork:
     """The same as a reference has it."""
     return build_network(random_lines(seed, side, spacing), PLANE, {"name": f"town {seed}"})
