@@ -31,6 +31,7 @@ from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.search import Ahead
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verdict import decide
+from roadgeo.matching.veto import contest
 from roadgeo.reference.opening import open_references
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.running.cluster import Cluster, DaskWorkers
@@ -208,7 +209,8 @@ class _Searcher:
         """Search parts together."""
         query, names, options = asked.query, asked.names, asked.options
         parts = [self.parts[name] for name in names]
-        searched = search_references(query, parts, options, options.search.time_limit_s)
+        limit_s = options.search.time_limit_s
+        searched = contest(query, search_references(query, parts, options, limit_s), parts, options, limit_s)
         searched = [result.less_likely(asked.against) for result in searched]
         least = options.min_log10_odds - _BELOW
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}

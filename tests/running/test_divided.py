@@ -17,6 +17,7 @@ from worlds.scenes import PLANE, random_lines
 from roadgeo.cli import main
 from roadgeo.errors import RoadgeoError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
@@ -105,6 +106,15 @@ def test_a_place_counts_only_against_all_of_the_map(town, monkeypatch, capsys):
     for out, more in (("one", []), ("two", ["--engine", "dask", "--jobs", "2", "--divide-map"])):
         main([*asked, "-o", out, *more])
         assert json.loads(capsys.readouterr().out)["status"] == "ambiguous"
+
+
+def test_a_false_hint_is_named_where_the_map_is_divided(town, monkeypatch, capsys):
+    monkeypatch.chdir(town)
+    lon, lat = to_lonlat(PLANE.crs, PLANE.to_crs(np.array([[2600.0, 2600.0]])))[0].tolist()
+    asked = ["locate", "c.png", "-r", "hamlet_map.gpkg", "--near", f"{lon},{lat},300", "--json", "-q"]
+    for out, more in (("alone", []), ("among", ["--engine", "dask", "--jobs", "2", "--divide-map"])):
+        main([*asked, "-o", out, *more])
+        assert json.loads(capsys.readouterr().out)["reason_code"] == "fits_elsewhere"
 
 
 def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch, capsys):
