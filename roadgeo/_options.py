@@ -33,6 +33,7 @@ def option(names: str, form: str | None, group: str, text: str, **more: Any) -> 
         `rare`: --help names it, and --help-all explains it.
         `limits`: least and greatest number, None for none; `above`: the least is not allowed itself.
         `read`: makes the value of a text; raises ValueError or a RoadgeoError, "got ..., expected ...".
+        `is_path`: whether it names a file.
         `plugins`: the group of plugins that it names; `ending`: of files that it takes, too.
         Whatever click alone needs.
     """

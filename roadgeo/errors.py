@@ -34,11 +34,12 @@ __all__ = [
 #: Packages by the extra, or else the package, to install for them. Onboard computers may lack those without an extra.
 _BRINGS = {
     "pymavlink": "mavlink",
+    "pyarrow": "parquet",
     "pandas": "geopandas",
     **{
         name.replace("-", "_"): name
         for name in (
-            *("geopandas", "h11", "mapbox-vector-tile", "networkx", "onnxruntime", "osmium", "osmnx", "pyarrow"),
+            *("geopandas", "h11", "mapbox-vector-tile", "networkx", "onnxruntime", "osmium", "osmnx"),
             *("pyogrio", "python-multipart", "requests", "scipy", "shapely", "starlette", "uvicorn"),
         )
     },

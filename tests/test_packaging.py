@@ -51,7 +51,7 @@ def test_a_missing_package_is_named_with_what_brings_it() -> None:
     left_out = [name for name in map(_name_of, PROJECT["dependencies"]) if name not in ON_BOARD | {"protobuf"}]
     for brings, package in [
         *((package, package) for package in left_out),
-        *((extra, _name_of(item)) for extra in ("mavlink",) for item in extras[extra]),
+        *((extra, _name_of(item)) for extra in ("mavlink", "parquet") for item in extras[extra]),
     ]:
         module = package.replace("-", "_")
         reported = str(name_package(ModuleNotFoundError(name=f"{module}.part")))

@@ -36,7 +36,7 @@ from roadgeo.cli.options import (
 )
 from roadgeo.cli.printing import complain, echo, is_set, paint, tell
 from roadgeo.cli.truths import read_truths
-from roadgeo.matching.hints import Taken, asked_of_camera, read_taken
+from roadgeo.matching.hints import asked_of_camera
 from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.registry import (
     ALSO,
@@ -122,27 +122,20 @@ class Locate:
     masks: tuple[str, ...] = argument("IMAGE...", many=True)
     references: tuple[str, ...] = take(Shared, "references")
     known: Known = part(Known)
-    dem: str = option("--dem", "FILE", IMAGE,
-        "Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
-        default="", type=click.Path(), rare=True)
     out_dir: str = take(Shared, "out_dir")
     report: bool = option("--report", "", RESULTS, "Also a page for the browser, located or not.")
     plot: bool = option("--plot", "", RESULTS, "Also a picture, to look at.")
+    batch: BatchOptions = part(BatchOptions)
     images: tuple[str, ...] = option("--image", "PHOTO", RESULTS,
         "Draw this photograph in place of its mask. One per mask, in order, or a folder of them. Repeatable.",
         type=click.Path(), multiple=True, default=())
     products: tuple[str, ...] = take(Shared, "products")
     as_json: bool = take(Shared, "as_json")
-    skip_existing: bool = option("--skip-existing/--overwrite", "", RESULTS,
-        "Keep results younger than their images, or make them anew, the default.", rare=True)
     explain: bool = option("--explain", "", RESULTS,
         "How far the search got, the best rejected places, what was missing: a picture and JSON.", rare=True)
     truth: str | None = option("--truth", "LON,LAT|FILE", RESULTS,
         "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
         rare=True)
-    taken: Taken | None = option("--take", "N|LON,LAT", RESULTS,
-        "Write a place that the last answer for the image lists, as chosen by you: the N-th, or the one nearest to"
-        " LON,LAT. Nothing is searched, unless there is no answer yet.", read=read_taken, rare=True)
     image: ImageOptions = part(ImageOptions)
     recursive: bool = take(Shared, "recursive")
     reading: ReadOptions = part(ReadOptions)
@@ -181,15 +174,13 @@ def locate_command(asked: Locate) -> int:
     # A mask alone gets threads; on a cluster each worker keeps to one.
     options = replace(options, threads=asked.jobs if len(tasks) == 1 and cluster is None else 1)
     make_folder(asked.out_dir)
-    batch = BatchOptions(
-        options,
-        outputs,
-        threaded(asked.reading, asked.jobs),
+    batch = replace(
+        asked.batch,
+        search=options,
+        outputs=outputs,
+        reading=threaded(asked.reading, asked.jobs),
         images=pair_images([task.mask for task in tasks], asked.images),
         exif=asked_of_camera(hinted(asked.known)),
-        dem=asked.dem,
-        skip_existing=asked.skip_existing,
-        taken=asked.taken,
         command=tuple(said_options(_OF_NO_ACCOUNT)),
     )
     opened = open_maps(asked.references, options.near)

@@ -264,6 +264,8 @@ def _click_option(home: type, of: Field[Any], said: Mapping[str, Any]) -> click.
         kind: dict[str, Any] = {"type": Read(of.name, read)}
     elif plugins:
         kind = {"type": Plugin(partial(installed, plugins), file_ending=ending or "")}
+    elif more.pop("is_path", False):
+        kind = {"type": click.Path()}
     else:
         kind = {} if "type" in more else _kind_of(home, of, limits, above)
     return _Option([*names.split(), of.name], **{"default": of.default, "metavar": form, **kind, **more})

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import webbrowser
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -81,19 +81,13 @@ class Serve:
     """What `roadgeo serve` is asked."""
 
     references: tuple[str, ...] = take(Shared, "references")
-    host: str = take(ServeOptions, "host")
-    port: int = take(ServeOptions, "port")
+    limits: ServeOptions = part(ServeOptions)
     token_file: str | None = option("--token-file", "FILE", OTHERS, "The token is the first line of this file.",
         type=click.Path())
     jobs: int = take(Shared, "jobs", help="Processes that locate. Default: 1.")
-    waiting: int = take(ServeOptions, "waiting")
-    max_bytes: int = take(ServeOptions, "max_bytes")
-    max_pixels: int = take(ServeOptions, "max_pixels")
     time_limit_s: float = take(Known, "time_limit_s", default=10.0,
         help="Stop each search then. Default: 10; requests may ask for less.")
     mavlink: str | None = take(Shared, "mavlink")
-    basemap: str = take(ServeOptions, "basemap")
-    basemap_attribution: str = take(ServeOptions, "basemap_attribution")
     no_browser: bool = option("--no-browser", "", OTHERS, "Do not open the page in a browser.")
     verbosity: Verbosity = part(Verbosity, "quiet")
 # fmt: on
@@ -204,7 +198,8 @@ def _options(asked: Serve) -> ServeOptions:
             raise click.UsageError(f"Cannot read the token: {error}.") from error
         if not token:
             raise click.UsageError(f"{asked.token_file} is empty, expected a token in its first line.")
-    if asked.host not in LOOPBACK and not token:
+    limits, n = asked.limits, asked.jobs
+    if limits.host not in LOOPBACK and not token:
         raise click.UsageError("--host needs a token: set ROADGEO_TOKEN, or give --token-file FILE.")
-    alike = {each.name: getattr(asked, each.name) for each in fields(ServeOptions) if hasattr(asked, each.name)}
-    return ServeOptions(**alike, token=token, workers=asked.jobs, connections=asked.jobs + asked.waiting + 64)
+    connections = n + limits.waiting + 64
+    return replace(limits, token=token, workers=n, time_limit_s=asked.time_limit_s, connections=connections)

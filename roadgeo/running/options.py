@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from roadgeo._options import IMAGE, option
+from roadgeo._options import IMAGE, RESULTS, option
+from roadgeo.matching.hints import Taken, read_taken
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
@@ -109,9 +110,10 @@ def _usual_outputs() -> OutputOptions:
     return OutputOptions()
 
 
+# fmt: off
 @dataclass(frozen=True)
 class BatchOptions:
-    """The work done for every mask of a batch.
+    """The work done for every mask of a batch; what each option means stands beside it.
 
     Attributes
     ----------
@@ -119,12 +121,6 @@ class BatchOptions:
         Drawn on the map instead of the masks.
     exif : tuple of str
         Hints, by `matching.hints.Hint.goes_to`, that are taken from the photograph, or else the mask.
-    dem : str
-        Terrain model with the height of the ground below the camera; "" for none.
-    skip_existing : bool
-        Keep results of the same question that are whole and younger than their masks.
-    taken : int, or (lon, lat), or None
-        The place of the last answer for an image that is written as its place (see `choosing.take_place`).
     command : tuple of str
         Options that ask for the same on the command line, for the results to name.
     """
@@ -134,10 +130,16 @@ class BatchOptions:
     reading: ReadOptions = field(default_factory=ReadOptions)
     images: Mapping[str, str] = field(default_factory=dict)
     exif: tuple[str, ...] = ()
-    dem: str = ""
-    skip_existing: bool = False
-    taken: int | tuple[float, float] | None = None
     command: tuple[str, ...] = ()
+    dem: str = option("--dem", "FILE", IMAGE,
+        "Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
+        default="", is_path=True, rare=True)
+    skip_existing: bool = option("--skip-existing/--overwrite", "", RESULTS,
+        "Keep results younger than their images, or make them anew, the default.", rare=True)
+    taken: Taken | None = option("--take", "N|LON,LAT", RESULTS,
+        "Write a place that the last answer for the image lists, as chosen by you: the N-th, or the one nearest to"
+        " LON,LAT. Nothing is searched, unless there is no answer yet.", read=read_taken, rare=True)
+    # fmt: on
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
