@@ -388,7 +388,7 @@ SETUP = (
     ),
     Option(
         QgsProcessingParameterBoolean, "INSTALL", "Install roadgeo into an environment of its own",
-        "With that Python, in the folder below; takes some minutes, 1.3 GB, and the network.",
+        "With that Python, in the folder below; takes some minutes, 1.1 GB, and the network.",
         settings={"defaultValue": False},
     ),
     *_fold(
