@@ -89,7 +89,7 @@ def test_places_whose_frames_left_the_view_are_forgotten(flown):
 
 @pytest.fixture(scope="module")
 def twice(flown):
-    """The town, and six kilometres east what it was before it grew; a circle around where the frames would lie there."""
+    """The town, and six kilometres east what it was before it grew; a circle around where the frames would lie."""
     flight, _, reference = flown
     plane, lines = reference.index.plane, [shapely.LineString(line) for line in reference.network.graph.polylines()]
     before = [affinity.translate(line, 6000.0) for k, line in enumerate(lines) if k % 5]
