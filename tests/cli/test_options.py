@@ -118,6 +118,15 @@ def test_one_pixel_size_is_one_fact_in_every_spelling() -> None:
         assert read_query_string(f"gsd={text}") == {"gsd_m": (0.3, 0.6)} == {"gsd_m": GSD.convert(text, None, None)}
 
 
+def test_the_help_of_an_option_is_written_once() -> None:
+    """In the field that it is; other commands, QGIS, HTTP and Python take it from there."""
+    files = Path(roadgeo.__file__).parent.rglob("*.py")
+    text = "".join(re.sub(r'"\s+"', "", file.read_text("utf-8")) for file in files)
+    said = {param.opts[0]: str(param.help) for param in command("locate").params if isinstance(param, click.Option)}
+    counts = {name: text.count(re.split(r"(?<=[^.]\.) ", help_)[0]) for name, help_ in said.items()}
+    assert {name: count for name, count in counts.items() if count != 1} == {}
+
+
 def test_options_of_plugins_dialogs_exist_on_the_command_line() -> None:
     """QGIS says what was set by options: each has to exist, with the words among which one chooses."""
     plugin = Path(roadgeo.__file__).parent / "qgis" / "plugin"
