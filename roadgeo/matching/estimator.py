@@ -152,11 +152,6 @@ class TripleEstimator:
         """The unit (N,) of each intersection of the map."""
         return cut_to_units(self.index.xy)
 
-    @property
-    def is_told(self) -> bool:
-        """Whether hints on the place or the heading exclude most rivals."""
-        return self.near is not None or self.options.within is not None or self.options.camera.heading is not None
-
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 

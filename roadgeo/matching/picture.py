@@ -8,8 +8,8 @@ b = (1 - p) / (1 - pi). Under a place H
              + sum over the other ground    log[ (1 - f pi) b + f pi s ]
 
 with m the share of the map's roads that the picture lacks, and f the density of roads that the map lacks, in parts of
-the picture's own. Both are marginalised over a small grid. A place without evidence has log L = 0. A drawn mask is a
-picture of two probabilities. Neighbouring cells agree together, so `_STATEMENT_M` metres of road count once.
+the picture's own. Both are marginalised over a small grid. A place without evidence has log L = 0. Neighbouring cells
+agree together, so `_STATEMENT_M` metres of road count once.
 
 All shifts of a place are compared at once: the rectified picture is correlated with the map by FFT.
 """
@@ -39,8 +39,6 @@ _MISSING = np.array([0.05, 0.15, 0.3, 0.5, 0.75])
 _FALSE = np.array([0.1, 0.3, 0.6, 1.0])
 #: Levels of log odds: this number for each nat, up to this log odds either way.
 _FINE, _SUREST = 16.0, 5.5
-#: Probabilities of a drawn mask on its roads and elsewhere; half the width of a road, and how far its edge is blurred.
-_DRAWN, _HALF_ROAD_M, _BLUR_M = (0.98, 0.02), 5.0, 1.5
 #: Side of the ground over which the usual probability of road is taken, metres. A frame of some kilometres shows town
 #: and field: with one for all of it, any dense roads under the town gain. Five crops of 1.6 to 3.2 km, truth and best
 #: wrong place: 116 and 114, 95 and 45, 56 and 186, 60 and 146, 35 and 9 with one for all; 100 and 31, 73 and 6, 40 and
@@ -49,15 +47,13 @@ _USUAL_M = 300.0
 #: Width of the map's roads, as they are drawn, metres.
 _ROAD_M = 8.0
 #: This length of the map's roads counts as one independent statement, metres, but never fewer than a fifth as many
-#: pixels; longer in a drawn mask, for its roads are sure even where they are wrong. Without a place, the lead of the
-#: best place over the next falls off like an exponential: with these lengths a lead of 1 is met one time in ten.
-_STATEMENT_M, _DRAWN_STATEMENT_M, _STATEMENT_PX = 250.0, 500.0, 0.2
+#: pixels. Without a place, the lead of the best place over the next falls off like an exponential: with this length a
+#: lead of 1 is met one time in ten.
+_STATEMENT_M, _STATEMENT_PX = 250.0, 0.2
 #: A greater log10 likelihood counts as this one (see `Picture.lead`).
 _MOST_WORTH = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
-#: Pixel sizes, a factor apart, at which a drawn mask's roads are as wide as a road.
-_GSD_STEP = 1.05
 #: Steps by which a place is moved, cells.
 _STEPS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 
@@ -81,12 +77,11 @@ class _Levels(NamedTuple):
 
 
 class Picture:
-    """Weighs places of one scene on one map, all with the same yardstick; see `Evidence` for `gsd_m`."""
+    """Weighs places of one scene with a probability on one map, by one yardstick; see `Evidence` for `gsd_m`."""
 
     def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
-        statement_m = _DRAWN_STATEMENT_M if scene.probability is None else _STATEMENT_M
-        self.statement_px = statement_m * max(1.0 / gsd_m, _STATEMENT_PX)
+        self.statement_px = _STATEMENT_M * max(1.0 / gsd_m, _STATEMENT_PX)
 
     def weigh(self, matrix: FloatArray, ground: Ground | None = None) -> float:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""
@@ -212,10 +207,9 @@ class Picture:
         columns, rows = np.ceil(places.max(axis=0)).astype(int) + 1 - low
         if not 0 < max(columns, rows) < 4000:
             return None
-        step = 0 if scene.probability is not None else round(math.log(gsd_m) / math.log(_GSD_STEP))
         smaller = max(1, int(cell_m / (gsd_m * scene.field_scale)))
         usual_cells = round(_USUAL_M / (self.gsd_m * scene.field_scale * smaller))
-        levels = _levels(scene, step, smaller, 2 * (usual_cells // 2) + 1)
+        levels = _levels(scene, smaller, 2 * (usual_cells // 2) + 1)
         to_cells = np.array([[1, 0, -ground.corner[0]], [0, 1, -ground.corner[1]], [0, 0, cell_m]]) / cell_m
         to_cells[:2] -= np.outer(low, to_cells[2])
         to_plane = np.diag([levels.scale, -levels.scale, 1.0])
@@ -234,17 +228,12 @@ def by_picture(place: Place, gsd_m: float) -> Place:
 
 
 @lru_cache(maxsize=16)
-def _levels(scene: Scene, step: int, smaller: int, around: int) -> _Levels:
-    """Return the picture on cells `smaller` times coarser; a drawn mask's pixels are `_GSD_STEP ** step` metres.
+def _levels(scene: Scene, smaller: int, around: int) -> _Levels:
+    """Return the picture on cells `smaller` times coarser.
 
     The log odds of each cell are shifted so that what is usual `around` it, in cells, is usual in the picture.
     """
-    if scene.probability is None:
-        beyond = (scene.field * (scene.field_scale * _GSD_STEP**step) - _HALF_ROAD_M) / _BLUR_M
-        on, off = _DRAWN
-        probability: AnyArray = off + (on - off) / (1.0 + np.exp(np.clip(beyond, -30.0, 30.0)))
-    else:
-        probability = scene.probability
+    probability: AnyArray = np.asarray(scene.probability)
     observed: AnyArray = scene.observed.astype(np.float32)
     if smaller > 1:
         height, width = (max(n // smaller, 1) for n in observed.shape)

@@ -167,10 +167,8 @@ def test_another_place_lies_apart_and_meets_other_roads(lattice, monkeypatch, ea
 def test_the_picture_counts_a_statement_each_250_m_and_no_likelihood_beyond_10(view):
     soft = replace(view.scene, probability=np.zeros((2, 2), np.float32))
     assert [Picture(soft, view.index, gsd_m).statement_px for gsd_m in (1.0, 10.0)] == [250.0, 50.0]
-    drawn = Picture(replace(view.scene, probability=None), view.index, 1.0)
-    assert drawn.statement_px == 500.0
-    assert drawn.lead(8.0, 3.0) == pytest.approx(5.0)
-    assert drawn.lead(20.0, 15.0) == pytest.approx(2.5)
+    assert Picture.lead(8.0, 3.0) == pytest.approx(5.0)
+    assert Picture.lead(20.0, 15.0) == pytest.approx(2.5)
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
