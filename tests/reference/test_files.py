@@ -370,7 +370,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, network: RoadNe
         "    print(error)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "grid.gpkg"), str(limit)],
+        [sys.executable, "-B", "-c", code, str(tmp_path / "grid.gpkg"), str(limit)],  # -B: or modules are cut off
         check=True, capture_output=True, text=True, cwd=Path(__file__).parents[1],
     )  # fmt: skip
     assert done.stdout.startswith(f"cannot write {tmp_path / 'grid.gpkg'}: "), done.stderr
