@@ -41,6 +41,7 @@ def draw_places(path: Path, images: Any, masks: MaskFiles, done: Sequence[Trial]
         _draw_ground(ground, index, matrix, pixels)
         for ax in (photo, seen, ground):
             ax.set(xticks=[], yticks=[])
+    figure.set_size_inches(12.0, 4.0 * len(right))
     figure.savefig(path, dpi=80)
 
 
