@@ -123,8 +123,8 @@ def _locate(given: Place, query: Query, options: CheckOptions, beyond: bool) -> 
     only_there = replace(hints, match=replace(hints.match, sweeps=(), without_roads=(), roads=False))
     proposed = [(given.index, place.matrix) for place in _around(given, options)]
     limit_s = hints.search.time_limit_s
-    found = search_references(query, parts, only_there, limit_s, proposed=proposed)
-    return decide(query, contest(query, found, parts, hints, limit_s) if beyond else found, hints)
+    results = search_references(query, parts, only_there, limit_s, proposed=proposed)
+    return decide(query, contest(query, results, parts, hints, limit_s) if beyond else results, hints)
 
 
 def _as_hints(given: Place, options: CheckOptions) -> LocateOptions:
@@ -158,22 +158,22 @@ def _judge(location: Location, given: Place, options: CheckOptions) -> Checked:
     best = location.places[0]
     rival = None if best.rival is None else _displacement(given, best.rival)
     there = replace(given, matrix=best.matrix @ PIXEL_TO_PLANE)
-    known = Checked("unknown", "", None, None, best.score, rival, _agreeing(there), _agreeing(given))
+    checked = Checked("unknown", "", None, None, best.score, rival, _agreeing(there), _agreeing(given))
     if not location.located:
-        return replace(known, reason=_why_unknown(location, given, options))
-    found = _displacement(given, best)
-    off, sigma = found.over(given.corners), found.sigma_over(given.corners)
+        return replace(checked, reason=_why_unknown(location, given, options))
+    offset = _displacement(given, best)
+    off, sigma = offset.over(given.corners), offset.sigma_over(given.corners)
     agrees, said = off <= options.tolerance_m, f"off by {off:.1f} ± {sigma:.1f} m"
     if best.score < _MIN_SCORE and not agrees:
-        return replace(known, reason=_stands_out_too_little(best.score, _MIN_SCORE, options))
-    known = replace(known, displacement=found, placement=best)
+        return replace(checked, reason=_stands_out_too_little(best.score, _MIN_SCORE, options))
+    checked = replace(checked, displacement=offset, placement=best)
     if sigma > options.max_sigma_m:
-        return replace(known, reason=f"the roads place it to {sigma:.1f} m only")
+        return replace(checked, reason=f"the roads place it to {sigma:.1f} m only")
     if agrees:
-        return replace(known, verdict="agrees", reason=said)
-    if found.significance < _MIN_CHI2 or off - sigma < options.tolerance_m:
-        return replace(known, reason=f"{said}: that may be chance")
-    return replace(known, verdict="off", reason=said)
+        return replace(checked, verdict="agrees", reason=said)
+    if offset.significance < _MIN_CHI2 or off - sigma < options.tolerance_m:
+        return replace(checked, reason=f"{said}: that may be chance")
+    return replace(checked, verdict="off", reason=said)
 
 
 def _why_unknown(location: Location, given: Place, options: CheckOptions) -> str:

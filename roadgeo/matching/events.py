@@ -31,8 +31,8 @@ class Events:
 
     def of(self, kind: str) -> list[Any]:
         """Return the values of the events of a kind: alone, or as a tuple of several."""
-        found = [what for name, *what in self.items if name == kind]
-        return [what[0] if len(what) == 1 else tuple(what) for what in found]
+        events = [what for name, *what in self.items if name == kind]
+        return [what[0] if len(what) == 1 else tuple(what) for what in events]
 
 
 @dataclass

@@ -106,18 +106,18 @@ class Evidence:
 
     def weigh(self, matrix: FloatArray) -> float:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""
-        seen, mapped = self._count(matrix, math.inf, (1, 1))
-        return self._log10(seen[0], mapped[0])
+        traced, mapped = self._count(matrix, math.inf, (1, 1))
+        return self._log10(traced[0], mapped[0])
 
     def agreement(self, matrix: FloatArray) -> Agreement:
         """Return the agreement at a place."""
-        seen, mapped = self._count(matrix, math.inf, (1, 1))
-        forward, backward = (float(bins[0, :_AGREEING].sum() / max(bins.sum(), 1e-9)) for bins in (seen, mapped))
-        return Agreement(forward, backward, self._log10(seen[0], mapped[0]))
+        traced, mapped = self._count(matrix, math.inf, (1, 1))
+        forward, backward = (float(bins[0, :_AGREEING].sum() / max(bins.sum(), 1e-9)) for bins in (traced, mapped))
+        return Agreement(forward, backward, self._log10(traced[0], mapped[0]))
 
-    def _log10(self, seen: FloatArray, mapped: FloatArray) -> float:
+    def _log10(self, traced: FloatArray, mapped: FloatArray) -> float:
         """Return log10 L of histograms."""
-        nats = self._nats(*self._ratios(mapped), seen, mapped)
+        nats = self._nats(*self._ratios(mapped), traced, mapped)
         most = float(nats.max())
         return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
 
@@ -132,15 +132,15 @@ class Evidence:
         roads that explain this place best, and by the query's roads alone: the best of many wrong places lies where the
         map shows few roads that the query lacks, and all other places show more of them in every piece.
         """
-        seen, mapped = self._count(matrix, self._piece_px, self._shape)
+        traced, mapped = self._count(matrix, self._piece_px, self._shape)
         of_query, of_map = self._ratios(mapped)
-        nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
+        nats = self._nats(of_query, of_map, traced.sum(axis=0), mapped.sum(axis=0))
         sigma, _, false = np.unravel_index(int(nats.argmax()), nats.shape)
         ratios = of_query[sigma, false]
 
         def compare(other: FloatArray) -> tuple[float, float]:
             there, mapped = self._count(other, self._piece_px, self._shape)
-            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), log10_lead((seen - there) @ ratios)
+            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), log10_lead((traced - there) @ ratios)
 
         return compare
 
@@ -176,20 +176,20 @@ class Evidence:
         scene = self.scene
         side = max(max(scene.size) / _N_REGIONS, _REGION_M / self.gsd_m)
         columns, rows = (max(round(length / side), 1) for length in scene.size)
-        seen, mapped = self._count(matrix, side, (rows, columns))
+        traced, mapped = self._count(matrix, side, (rows, columns))
         of_query, of_map = self._ratios(mapped)
-        nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
+        nats = self._nats(of_query, of_map, traced.sum(axis=0), mapped.sum(axis=0))
         sigma, missing, false = np.unravel_index(int(nats.argmax()), nats.shape)
-        worth = seen @ of_query[sigma, false] + mapped @ of_map[sigma, missing]
+        explained = traced @ of_query[sigma, false] + mapped @ of_map[sigma, missing]
         row, column = np.divmod(np.arange(rows * columns), columns)
         middles = np.stack(((column + 0.5) * side, -(row + 0.5) * side), axis=1)
         scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / sampling(matrix, scene.size)
         near = np.nan_to_num(scales, nan=math.inf) < _FAR
-        both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
+        both = np.minimum(traced.sum(axis=1), mapped.sum(axis=1)) * near
         if not both.any():
             return 0.0
-        least = _HARDLY * max(float(worth[near].sum()), 0.0) * both / both.sum()
-        share = float(both[worth < least].sum() / both.sum())
+        least = _HARDLY * max(float(explained[near].sum()), 0.0) * both / both.sum()
+        share = float(both[explained < least].sum() / both.sum())
         return max(share - 0.5 / len(both), 0.0)  # half a region is usual: a railway may run through it
 
     def _scale(self, matrix: FloatArray) -> float:
@@ -201,15 +201,15 @@ class Evidence:
         scene, index = self.scene, self.index
         scale = self._scale(matrix)
         ground, step_m = Homography(matrix).everywhere(scene.corners), max(STEP_M, scene.field_scale * self.gsd_m)
-        seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
+        traced, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
             matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
             scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, MIN_COS,
             step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
-            seen, mapped,
+            traced, mapped,
         )  # fmt: skip
-        seen *= scene.road_length_px / max(len(scene.points), 1)
-        return seen, mapped
+        traced *= scene.road_length_px / max(len(scene.points), 1)
+        return traced, mapped
 
     def _ratios(self, mapped: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihood ratios of residuals of the query's roads and of the map's (sigma, share, bin).
@@ -221,9 +221,9 @@ class Evidence:
         of_map = _anyhow(reach * self.scene.road_length_px)
         return _log_ratios(of_query, 0.0), _log_ratios(of_map, self._blur)
 
-    def _nats(self, of_query: FloatArray, of_map: FloatArray, seen: FloatArray, mapped: FloatArray) -> FloatArray:
+    def _nats(self, of_query: FloatArray, of_map: FloatArray, traced: FloatArray, mapped: FloatArray) -> FloatArray:
         """Return log L by (sigma, missing, false)."""
-        return np.asarray(((of_query @ seen)[:, None, :] + (of_map @ mapped)[:, :, None]) / self.statement_px)
+        return np.asarray(((of_query @ traced)[:, None, :] + (of_map @ mapped)[:, :, None]) / self.statement_px)
 
     def nearby(
         self,
@@ -304,10 +304,10 @@ def match_intersections(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
 ) -> tuple[IntArray, FloatArray]:
     """Return the map intersection matched to each query intersection (N,), or -1, and their distance (N,), metres."""
-    found = scene.intersections
-    matched, distance = np.empty(len(found), np.int64), np.empty(len(found))
+    own = scene.intersections
+    matched, distance = np.empty(len(own), np.int64), np.empty(len(own))
     reach_m = 1.5 * tolerance_m(gsd_m)
-    match_all(matrix, found.xy, scene.branches, reach_m, MIN_COS, index.point_buckets, matched, distance)
+    match_all(matrix, own.xy, scene.branches, reach_m, MIN_COS, index.point_buckets, matched, distance)
     return matched, distance
 
 

@@ -296,12 +296,12 @@ def read_hint(name: str, value: Any) -> tuple[str, Any]:
         raise ValueError(f"{name}: {error}") from error
 
 
-def asked_of_camera(known: Mapping[str, Any]) -> tuple[str, ...]:
+def asked_of_camera(hints: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of hints, by `Hint.goes_to`, that are to be what the camera states."""
-    return tuple(name for name, value in known.items() if value == STATED)
+    return tuple(name for name, value in hints.items() if value == STATED)
 
 
-def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptions:
+def apply_hints(options: LocateOptions, hints: Mapping[str, Any]) -> LocateOptions:
     """Set the options of all stages from the hints that are known; other options stay unchanged.
 
     Parameters
@@ -309,7 +309,7 @@ def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptio
     known : mapping
         Values by `Hint.goes_to`; None if unknown. The caller must look up what the camera states, "exif".
     """
-    given = {name: value for name, value in known.items() if value not in (None, STATED)}
+    given = {name: value for name, value in hints.items() if value not in (None, STATED)}
 
     def among(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}

@@ -472,23 +472,25 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     from roadgeo.errors import RoadSourceError
 
     options = options or IndexOptions()
-    found = network.intersections
-    if len(found) < 3:
-        raise RoadSourceError(f"the roads have {len(found)} intersections, at least 3 are needed: take a larger area")
-    if len(found) > MAX_ANCHORS:
+    detected = network.intersections
+    if len(detected) < 3:
         raise RoadSourceError(
-            f"the roads have {len(found):,} intersections, at most {MAX_ANCHORS:,} are indexed in one piece:"
+            f"the roads have {len(detected)} intersections, at least 3 are needed: take a larger area"
+        )
+    if len(detected) > MAX_ANCHORS:
+        raise RoadSourceError(
+            f"the roads have {len(detected):,} intersections, at most {MAX_ANCHORS:,} are indexed in one piece:"
             " cut them up with `roadgeo index --shards auto`"
         )
-    what = f"indexing {len(found):,} intersections"
+    what = f"indexing {len(detected):,} intersections"
     say(what, 0.0)
-    grid, shape = neighbour_grid(found.xy, options.min_bucket_m)
+    grid, shape = neighbour_grid(detected.xy, options.min_bucket_m)
     segments = _cut_segments(network.graph, options.simplify_m)
     finer = (*grid[:2], grid[2] / _FINER), (_FINER * shape[0], _FINER * shape[1])
     roads = bucket_roads(segments, *finer)
     say(what, 0.3)
-    order, point_starts = sort_by_bucket(found.xy, grid, shape)
-    points = found.xy[order], found.branches()[order], found.tangents[order]
+    order, point_starts = sort_by_bucket(detected.xy, grid, shape)
+    points = detected.xy[order], detected.branches()[order], detected.tangents[order]
     of_points = _of_points(*points, point_starts, grid, shape, options)
 
     meta = {
@@ -498,7 +500,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         "grid": list(grid),
         "shape": list(shape),
         "index_options": asdict(options),
-        "n_intersections": len(found),
+        "n_intersections": len(detected),
         "n_segments": len(segments),
     }
     index = ReferenceIndex(

@@ -48,17 +48,17 @@ def find_lens(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinemen
     """Fit a lens; return None if the roads show no distortion."""
     best = None
     for start in _STARTS:
-        found = fit_lens(matrix, scene, index, refinement, start=start)
-        if found is not None and (best is None or found.share > best.share):
-            best = found
+        fitted = fit_lens(matrix, scene, index, refinement, start=start)
+        if fitted is not None and (best is None or fitted.share > best.share):
+            best = fitted
         if best is not None and best.share >= ENOUGH:
             break
     if best is None or _moves_px(best, scene) < 0.5 * _LEAST_PX:
         return None
-    found = fit_lens(best.matrix, scene, index, refinement, best.lens_k1)
-    if found is None or abs(found.lens_k1) < _SIGNIFICANCE * found.k1_sigma:  # a pinhole's image yields some k1, too
+    fitted = fit_lens(best.matrix, scene, index, refinement, best.lens_k1)
+    if fitted is None or abs(fitted.lens_k1) < _SIGNIFICANCE * fitted.k1_sigma:  # a pinhole's image yields some k1, too
         return None
-    return found if _moves_px(found, scene) >= _LEAST_PX else None
+    return fitted if _moves_px(fitted, scene) >= _LEAST_PX else None
 
 
 def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> Refined | None:
@@ -67,8 +67,8 @@ def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refineme
     A fit may have settled where only that part agrees. Returns None if hardly more of the road points lie on roads.
     """
     before = Equations(matrix, scene, index, refinement).meet().mean()
-    found = fit_lens(matrix, scene, index, refinement, None)
-    return found if found is not None and found.share > before + _BETTER else None
+    fitted = fit_lens(matrix, scene, index, refinement, None)
+    return fitted if fitted is not None and fitted.share > before + _BETTER else None
 
 
 def fit_lens(
@@ -107,8 +107,8 @@ def fit_lens(
             return None
         equations.p[:] = np.append((homography / homography[2, 2]).ravel()[:8], start)
     held = Held(points, places, 0.5 * equations.weight * len(core) / len(some))
-    found = equations.adjust(NO_PAIRS, held)
-    return None if found is None or found.share < max(_HOPELESS, FEWEST / len(equations.samples.xy)) else found
+    fitted = equations.adjust(NO_PAIRS, held)
+    return None if fitted is None or fitted.share < max(_HOPELESS, FEWEST / len(equations.samples.xy)) else fitted
 
 
 def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArray:
@@ -132,29 +132,29 @@ def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArra
     return np.asarray(met & (part == n_met.argmax()))
 
 
-def _moves_px(found: Refined, scene: Scene) -> float:
+def _moves_px(fitted: Refined, scene: Scene) -> float:
     """Return how far the lens moves the frame's corners, at most."""
     corners = scene.corners.astype(float)
-    moved = Lens.of(found.lens_k1, scene.size, y_up=True).bend(corners) - corners
+    moved = Lens.of(fitted.lens_k1, scene.size, y_up=True).bend(corners) - corners
     return float(np.hypot(*moved.T).max())
 
 
 def straighten_scene(scene: Scene, k1: float) -> Scene:
     """Return a scene as a pinhole would have seen it: its points moved back by a lens with k1."""
     lens = Lens.of(k1, scene.size, y_up=True)
-    found = scene.intersections
-    vectors = np.stack([np.cos(found.rays), np.sin(found.rays)], axis=-1).astype(float)
-    turned = lens.straighten_directions(np.broadcast_to(found.xy[:, None], vectors.shape), vectors)
-    rays = np.arctan2(turned[..., 1], turned[..., 0]).astype(found.rays.dtype)
-    straight = Intersections(lens.straighten(found.xy), rays, found.tangents, found.residual, found.node)
+    own = scene.intersections
+    vectors = np.stack([np.cos(own.rays), np.sin(own.rays)], axis=-1).astype(float)
+    turned = lens.straighten_directions(np.broadcast_to(own.xy[:, None], vectors.shape), vectors)
+    rays = np.arctan2(turned[..., 1], turned[..., 0]).astype(own.rays.dtype)
+    straight = Intersections(lens.straighten(own.xy), rays, own.tangents, own.residual, own.node)
     rows, columns = scene.field.shape
     cells = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1) * scene.field_scale
-    seen = (Lens.of(k1, scene.size).bend(cells) / scene.field_scale - 0.5).astype(np.float32)
-    field = cv2.remap(scene.field, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    source = (Lens.of(k1, scene.size).bend(cells) / scene.field_scale - 0.5).astype(np.float32)
+    field = cv2.remap(scene.field, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     soft = scene.probability
     if soft is not None:
-        soft = np.asarray(cv2.remap(soft, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR), np.float32)
-    observed = cv2.remap(scene.observed.astype(np.uint8), seen[..., 0], seen[..., 1], cv2.INTER_NEAREST)
+        soft = np.asarray(cv2.remap(soft, source[..., 0], source[..., 1], cv2.INTER_LINEAR), np.float32)
+    observed = cv2.remap(scene.observed.astype(np.uint8), source[..., 0], source[..., 1], cv2.INTER_NEAREST)
     return replace(
         scene,
         intersections=straight,

@@ -131,7 +131,7 @@ def build_pair_index(intersections: Intersections, options: TupleOptions) -> Pai
     return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
 
 
-def list_pairs(found: Intersections, chosen: IntArray, d_max: float, least_deg: float) -> IntArray:
+def list_pairs(intersections: Intersections, chosen: IntArray, d_max: float, least_deg: float) -> IntArray:
     """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
 
     Raises
@@ -141,7 +141,7 @@ def list_pairs(found: Intersections, chosen: IntArray, d_max: float, least_deg: 
     """
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(found.xy[chosen])
+    tree = cKDTree(intersections.xy[chosen])
     if len(chosen) ** 2 > _MAX_TUPLES:
         count = (int(tree.count_neighbors(tree, d_max)) - len(chosen)) // 2
         if count > _MAX_TUPLES:
@@ -150,14 +150,14 @@ def list_pairs(found: Intersections, chosen: IntArray, d_max: float, least_deg: 
                 f" {_MAX_TUPLES:,}; the paper's method does not fit it: use the usual one"
             )
     pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
-    dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
+    dx, dy = (intersections.xy[pairs[:, 1]] - intersections.xy[pairs[:, 0]]).T
     phi, least = np.arctan2(dy, dx), math.sin(math.radians(least_deg))
     passes = (dx != 0.0) | (dy != 0.0)
     for ends in pairs.T:
-        passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
+        passes &= intersections.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
         # NaN: no tangent
-        passes &= ~(np.abs(np.sin(found.tangents[ends] - phi[:, None])) <= least).any(axis=1)
-    pairs, codes = np.sort(pairs[passes], axis=1), type_codes(found)
+        passes &= ~(np.abs(np.sin(intersections.tangents[ends] - phi[:, None])) <= least).any(axis=1)
+    pairs, codes = np.sort(pairs[passes], axis=1), type_codes(intersections)
     swapped = codes[pairs[:, 0]] > codes[pairs[:, 1]]
     pairs[swapped] = pairs[swapped, ::-1]
     return np.asarray(pairs)
@@ -173,9 +173,9 @@ def type_keys(codes: IntArray, pairs: IntArray) -> IntArray:
     return np.asarray(256 * codes[pairs[:, 0]] + codes[pairs[:, 1]])
 
 
-def cotangents(found: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
+def cotangents(intersections: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
     """Return the (P, N_q) falling cotangents of the tangents of `ends` (P,), all with N_q, relative to the lines."""
-    tangents = found.tangents[ends, : int(found.n_tangents[ends[0]])].astype(float)
+    tangents = intersections.tangents[ends, : int(intersections.n_tangents[ends[0]])].astype(float)
     return np.asarray(-np.sort(-1.0 / np.tan(tangents - np.arctan2(dy, dx)[:, None]), axis=1))
 
 
@@ -208,11 +208,11 @@ def _fitted(index: ReferenceIndex, options: TupleOptions) -> Intersections:
     good[at[~(error <= options.fit_error_px)]] = False  # NaN: it is too short
     if options.from_center:
         starts = np.searchsorted(at, np.arange(len(index) + 1))
-        found = describe(index.xy, starts, lines, IntersectionOptions())
+        intersections = describe(index.xy, starts, lines, IntersectionOptions())
     else:
         rays, tangents = unpack_branches(index.branches), unpack_tangents(index.tangents)
-        found = Intersections(index.xy, rays, tangents, np.zeros(len(index), np.float32), np.arange(len(index)))
-    return found.only(np.flatnonzero(good))
+        intersections = Intersections(index.xy, rays, tangents, np.zeros(len(index), np.float32), np.arange(len(index)))
+    return intersections.only(np.flatnonzero(good))
 
 
 def _fit_lines(index: ReferenceIndex, start_m: float, length_m: float) -> tuple[IntArray, FloatArray, FloatArray]:

@@ -317,7 +317,7 @@ class _Search:
         """Find the candidates of the query tuple (a, b) by the matching rules (section 3.2, eq. 6)."""
         options, (pairs, tree) = self.options, self.index.tuples[key]
         low, high = math.log1p(-options.delta), math.log1p(options.delta)
-        found = []
+        listed = []
         for ends in np.array([(a, b), (b, a)] if self.codes[a] == self.codes[b] else [(a, b)]):
             step = self.query.xy[ends[1]] - self.query.xy[ends[0]]
             falling = [cotangents(self.query, ends[k : k + 1], step[:1], step[1:])[0] for k in (0, 1)]
@@ -329,8 +329,8 @@ class _Search:
                     d_c = np.log(np.concatenate((cross_ratios(first[None]), cross_ratios(second[None])), axis=1))[0]
                     rows = tree.query_ball_point(d_c + (low + high) / 2.0, (high - low) / 2.0, p=np.inf)
                     candidates = pairs[np.sort(np.array(rows, np.int64))]
-                found.append(_Correspondence(ends, (first * signs[0], second * signs[1]), candidates))
-        return found
+                listed.append(_Correspondence(ends, (first * signs[0], second * signs[1]), candidates))
+        return listed
 
     def test(self, a: int, b: int, key: int) -> None:
         """Draw candidates for the query tuple (a, b) of type `key` and test them, within the limits."""
@@ -405,11 +405,11 @@ class _Search:
         tree = cKDTree(np.column_stack([self.index.reference.xy, 2.0 * radius * self.index.codes]))
         at = np.column_stack([xy, 2.0 * radius * self.codes])
         distance, nearest = tree.query(at, distance_upper_bound=radius)
-        found = np.flatnonzero(np.isfinite(distance))
+        inside = np.flatnonzero(np.isfinite(distance))
         if self.options.one_to_one:
-            closest_first = found[np.argsort(distance[found], kind="stable")]
-            found = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])
-        return np.column_stack([found, nearest[found]])
+            closest_first = inside[np.argsort(distance[inside], kind="stable")]
+            inside = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])
+        return np.column_stack([inside, nearest[inside]])
 
     def located(self, homography: FloatArray) -> PairMatch:
         """Report the best homography; it is first refined on its matches, as long as that matches more."""

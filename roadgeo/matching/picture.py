@@ -51,7 +51,7 @@ _ROAD_M = 8.0
 #: lead of 1 is met one time in ten.
 _STATEMENT_M, _STATEMENT_PX = 250.0, 0.2
 #: A greater log10 likelihood counts as this one (see `Picture.lead`).
-_MOST_WORTH = 10.0
+_MOST_LIKELIHOOD = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
 #: Steps by which a place is moved, cells.
@@ -108,13 +108,13 @@ class Picture:
         return np.asarray(unit * ((levels.on @ under)[:, None] + levels.off @ (whole - under)))
 
     @staticmethod
-    def lead(worth: float, rival: float) -> float:
+    def lead(likelihood: float, rival: float) -> float:
         """Return the log10 lead of a place over a rival, from the log10 L of each.
 
         In a grid that resembles its mirror image, a wrong place leads by a constant part of its likelihood, and so by
-        more the larger the frame. A likelihood beyond `_MOST_WORTH` counts by the part that the rival lacks.
+        more the larger the frame. A likelihood beyond `_MOST_LIKELIHOOD` counts by the part that the rival lacks.
         """
-        return (worth - max(rival, 0.0)) * min(1.0, _MOST_WORTH / max(worth, 1e-9))
+        return (likelihood - max(rival, 0.0)) * min(1.0, _MOST_LIKELIHOOD / max(likelihood, 1e-9))
 
     def place(self, matrix: FloatArray, log10_likelihood: float) -> Place:
         """Return a place by its homography (3, 3), with its likelihood by the picture."""
@@ -241,10 +241,10 @@ def _levels(scene: Scene, smaller: int, around: int) -> _Levels:
         probability, observed = (
             cv2.resize(cells[cut], (width, height), interpolation=cv2.INTER_AREA) for cells in (probability, observed)
         )
-    seen = observed > 0.5
+    shown = observed > 0.5
     surest = 1.0 / (1.0 + math.exp(_SUREST))
-    usual = float(np.clip(probability[seen].mean() if seen.any() else 0.5, 2 * surest, 1.0 - 2 * surest))
-    nearby = np.clip(_mean_around(probability, seen, around), 2 * surest, 1.0 - 2 * surest)
+    usual = float(np.clip(probability[shown].mean() if shown.any() else 0.5, 2 * surest, 1.0 - 2 * surest))
+    nearby = np.clip(_mean_around(probability, shown, around), 2 * surest, 1.0 - 2 * surest)
     odds = np.arange(int(2 * _SUREST * _FINE) + 1) / _FINE - _SUREST
     p = 1.0 / (1.0 + np.exp(-odds))
     road, other = p / usual, (1.0 - p) / (1.0 - usual)
@@ -256,14 +256,14 @@ def _levels(scene: Scene, smaller: int, around: int) -> _Levels:
     missing, false = _MISSING[:, None], usual * _FALSE[:, None]
     on_road = np.log((1.0 - missing) * road + missing * other)
     elsewhere = np.log((1.0 - false) * other + false * road)
-    return _Levels(np.where(seen, cells, np.uint8(neutral)), scene.field_scale * smaller, neutral, on_road, elsewhere)
+    return _Levels(np.where(shown, cells, np.uint8(neutral)), scene.field_scale * smaller, neutral, on_road, elsewhere)
 
 
-def _mean_around(probability: AnyArray, seen: AnyArray, around: int) -> AnyArray:
+def _mean_around(probability: AnyArray, shown: AnyArray, around: int) -> AnyArray:
     """Return the mean of the probability over the ground observed `around` each cell, an odd number of cells."""
     sums, counts = (
         cv2.boxFilter(cells, cv2.CV_32F, (around, around), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for cells in (np.where(seen, probability, 0.0).astype(np.float32), seen.astype(np.float32))
+        for cells in (np.where(shown, probability, 0.0).astype(np.float32), shown.astype(np.float32))
     )
     return np.asarray(sums / np.maximum(counts, 1.0))
 

@@ -228,10 +228,10 @@ class Equations:
         scatter = rms * max(1.0, rms / (_USUAL_RMS * self.sigma_m)) / self.unit
         covariance = np.asarray(np.linalg.inv(normal) * scatter**2, float)
         corners = self.corner_covariance(covariance[:8, :8])
-        found = denormalise(self.p[:8], self.scene.center, self.scene.half_size, self._origin, self.unit)
+        matrix = denormalise(self.p[:8], self.scene.center, self.scene.half_size, self._origin, self.unit)
         k1_sigma = math.sqrt(max(float(covariance[8, 8]), 0.0)) if n == 9 else 0.0
         k1, share = float(self.p[8]), used / max(len(self.samples.xy), 1)
-        return Refined(found / found[2, 2], rms, corners, k1, k1_sigma, share)
+        return Refined(matrix / matrix[2, 2], rms, corners, k1, k1_sigma, share)
 
     def corner_covariance(self, covariance: FloatArray) -> FloatArray:
         """Return the covariance (8, 8) of the frame's corners, square metres, from the homography's (8, 8)."""
@@ -329,16 +329,16 @@ def refine_between(
     Returns the homography and the scene with road points between the two. Returns both unchanged if such points are
     few, or if no more points lie on roads afterwards: a false road beside a true road looks alike.
     """
-    found, seen = refined, scene
+    best, best_scene = refined, scene
     for n_points in _ROUNDS:
-        moved, left = between_carriageways(found.matrix, scene, index, matched)
-        again = None if moved is scene else refine(found.matrix, moved, index, left, options, n_points, held=True)
+        moved, left = between_carriageways(best.matrix, scene, index, matched)
+        again = None if moved is scene else refine(best.matrix, moved, index, left, options, n_points, held=True)
         if again is None:
             return refined, scene
-        found, seen = again, moved
+        best, best_scene = again, moved
     before = weight_on_roads(refined.matrix, scene, index)
-    better = weight_on_roads(found.matrix, seen, index) >= before
-    return (found, seen) if better else (refined, scene)
+    better = weight_on_roads(best.matrix, best_scene, index) >= before
+    return (best, best_scene) if better else (refined, scene)
 
 
 def between_carriageways(
@@ -367,9 +367,9 @@ def between_carriageways(
 
 def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, index: ReferenceIndex) -> FloatArray:
     """Return the nearest points (S, 2) on roads of the map that run along points (S, 2); NaN beyond `reach` (S,)."""
-    found = np.empty((len(at), 3))
-    road_residuals(np.eye(3), np.ascontiguousarray(at), along, reach, MIN_COS, index.road_buckets, found)
-    return np.asarray(at + found[:, :1] * found[:, 1:])
+    feet = np.empty((len(at), 3))
+    road_residuals(np.eye(3), np.ascontiguousarray(at), along, reach, MIN_COS, index.road_buckets, feet)
+    return np.asarray(at + feet[:, :1] * feet[:, 1:])
 
 
 def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:

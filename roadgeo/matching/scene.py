@@ -154,20 +154,20 @@ def sample_roads(graph: RoadGraph, spacing: float) -> tuple[FloatArray, FloatArr
     return graph.coords[segment] + fraction[:, None] * steps[segment], steps[segment] / lengths[segment][:, None]
 
 
-def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersections:
+def _nearest(intersections: Intersections, center: FloatArray, most: int) -> Intersections:
     """Return the `most` intersections nearest to a point (2,), in their own order."""
-    if len(found) <= most:
-        return found
-    kept = np.sort(np.argsort(np.hypot(*(found.xy - center).T), kind="stable")[:most])
-    return found.only(kept)
+    if len(intersections) <= most:
+        return intersections
+    kept = np.sort(np.argsort(np.hypot(*(intersections.xy - center).T), kind="stable")[:most])
+    return intersections.only(kept)
 
 
 def _probability_at(points: FloatArray, probability: AnyArray) -> FloatArray:
     """Return the greatest probability of road (S,) within a pixel of each point (S, 2) of the query plane."""
     height, width = probability.shape
-    known = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability)
+    stated = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability)
     column, row = np.clip((points * (1.0, -1.0)).astype(np.int64), 0, (width - 1, height - 1)).T
-    around = [known[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
+    around = [stated[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
     return np.asarray(np.max(around, axis=0) / PROBABILITY_SURE)
 
 
@@ -195,9 +195,9 @@ def prepare_scene(
     cv2.polylines(canvas, lines, False, 0, 1, cv2.LINE_8, 4)
     field = np.asarray(cv2.distanceTransform(canvas, cv2.DIST_L2, 3), np.float32)
     if observed is None:
-        seen = np.ones(cells, bool)
+        shown = np.ones(cells, bool)
     else:
-        seen = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
+        shown = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
     intersections = _nearest(intersections, Frame(*size).plane_center, _MAX_INTERSECTIONS)
     neighbours = query_neighbours(intersections.xy, _N_NEIGHBOURS)
     return Scene(
@@ -214,15 +214,15 @@ def prepare_scene(
         n_edges=graph.n_edges,
         field=field,
         field_scale=scale,
-        observed=seen,
+        observed=shown,
         probability=None if probability is None else _reduced(probability, cells),
     )
 
 
 def _reduced(probability: AnyArray, cells: tuple[int, int]) -> Float32Array:
     """Return the mean probability of road of each cell (h, w) of the reduced frame, 0 to 1."""
-    known = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability).astype(np.float32)
-    return np.asarray(cv2.resize(known, cells[::-1], interpolation=cv2.INTER_AREA) / PROBABILITY_SURE, np.float32)
+    stated = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability).astype(np.float32)
+    return np.asarray(cv2.resize(stated, cells[::-1], interpolation=cv2.INTER_AREA) / PROBABILITY_SURE, np.float32)
 
 
 #: Lengths in road widths: roads nearer to each other are a single road, intersections nearer a single intersection;
@@ -237,9 +237,9 @@ def trace_query(mask: RoadMask) -> tuple[Scene, RoadGraph]:
     width = traced.road_width_px
     near = SimplifyOptions(merge_radius=_MERGE * width, fuse_distance=_FUSE * width, stub_length=_STUB * width)
     graph = simplify(traced.graph, near)
-    found = find_intersections(graph, _lengths(width))
+    intersections = find_intersections(graph, _lengths(width))
     height, wide = mask.shape
-    scene = prepare_scene(graph, found, (wide, height), mask.observed, mask.probability)
+    scene = prepare_scene(graph, intersections, (wide, height), mask.observed, mask.probability)
     return replace(scene, road_width_px=width), graph
 
 
@@ -262,8 +262,8 @@ class Query:
     def intersections_by(self, tangent_px: float) -> Intersections:
         """Return the scene's intersections with tangents of the first pixels of their branches."""
         lengths = replace(_lengths(self.scene.road_width_px), tangent_length=tangent_px, skip_length=0.0)
-        found = find_intersections(self.graph, lengths)
-        return found.only(np.flatnonzero(np.isin(found.node, self.scene.intersections.node)))
+        detected = find_intersections(self.graph, lengths)
+        return detected.only(np.flatnonzero(np.isin(detected.node, self.scene.intersections.node)))
 
 
 def read_query(mask: RoadMask | AnyArray | str | Path) -> Query:

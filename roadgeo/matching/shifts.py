@@ -118,8 +118,8 @@ def search_nearby(
     to_map = Homography(start)
     points = to_map(scene.points[::thin])
     ends = to_map(scene.points[::thin] + scene.directions[::thin])
-    seen = np.isfinite(points).all(axis=1) & np.isfinite(ends).all(axis=1)
-    points, ends = points[seen], ends[seen]
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(ends).all(axis=1)
+    points, ends = points[finite], ends[finite]
     center = to_map(scene.center)
     frame = to_map(scene.corners)
     if not len(points) or not np.isfinite(frame).all():

@@ -177,8 +177,8 @@ def propose(
     # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
-    seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
-    costs = _count_alike(seen, weighed, _starts(tuple(indexes)))
+    traced = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
+    costs = _count_alike(traced, weighed, _starts(tuple(indexes)))
     n_reference = sum(map(len, indexes))
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     limits = TripleLimits(_CODES_PER_VERTEX, tolerance, MIN_COS, scale, min_ratio)
@@ -194,9 +194,9 @@ def propose(
         a = int(weighed[i])
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
-        shares = _shares(seen, a, indexes)
+        shares = _shares(traced, a, indexes)
         return [
-            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, room.hits)
+            _look_up(traced, a, slots, index, options.bounds(n_reference, share), limits, room.hits)
             for index, share in zip(indexes, shares, strict=True)
         ]
 
@@ -277,29 +277,29 @@ def _added_starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
     return (starts >> max(0, int(starts[-1]).bit_length() - 31)).astype(np.int32)
 
 
-def _count_alike(seen: TripleQuery, anchors: IntArray, starts: Int32Array) -> IntArray:
+def _count_alike(traced: TripleQuery, anchors: IntArray, starts: Int32Array) -> IntArray:
     """Return how many entries of a table are in the cells of each triple of the anchors (see `count_alike`)."""
-    k = seen.neighbours.shape[1]
+    k = traced.neighbours.shape[1]
     costs = np.empty((len(anchors), k, k), np.int64)
     count_alike(
-        seen.xy, seen.tangents, seen.sides, seen.neighbours, anchors, _MIN_SHAPE, _CODES_PER_VERTEX,
+        traced.xy, traced.tangents, traced.sides, traced.neighbours, anchors, _MIN_SHAPE, _CODES_PER_VERTEX,
         starts, costs,
     )  # fmt: skip
     return costs
 
 
-def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex]) -> FloatArray:
+def _shares(traced: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex]) -> FloatArray:
     """Return each index's share of an anchor's work: half of it by size, half by the entries to compare."""
     if len(indexes) == 1:
         return np.ones(1)
     anchors = np.array([anchor])
     sizes = np.array([len(index) for index in indexes], float)
-    costs = [np.maximum(_count_alike(seen, anchors, index.table_starts), 0).sum() for index in indexes]
+    costs = [np.maximum(_count_alike(traced, anchors, index.table_starts), 0).sum() for index in indexes]
     return np.asarray(sizes / sizes.sum() + np.array(costs) / max(sum(costs), 1)) / 2.0
 
 
 def _look_up(
-    seen: TripleQuery,
+    traced: TripleQuery,
     anchor: int,
     slots: IntArray,
     index: ReferenceIndex,
@@ -310,8 +310,8 @@ def _look_up(
     """Look up an anchor's triples in an index; return their proposals there, the best placed first."""
     max_hits, max_compared = bounds
     ids, affine = hits = Hits(hits.ids[:max_hits], hits.affine[:max_hits])
-    n_hits, n_compared = look_up_each(seen, anchor, slots, max_compared, index.triple_map, limits, hits)
-    k = seen.neighbours.shape[1]
+    n_hits, n_compared = look_up_each(traced, anchor, slots, max_compared, index.triple_map, limits, hits)
+    k = traced.neighbours.shape[1]
     # hits on the same map intersection that agree make a proposal; proposals with most neighbours placed come first
     out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
     out_affine = np.empty((len(out_ids), 4))

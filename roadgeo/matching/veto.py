@@ -62,14 +62,14 @@ def contest(
         free = replace(free, effort="quick", search=brief)
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
-    found = search_references(query, here, free, time_limit_s)
-    others = [place for result in found for place in (result.likeliest if is_reported else result.places[:1])]
+    results = search_references(query, here, free, time_limit_s)
+    others = [place for result in results for place in (result.likeliest if is_reported else result.places[:1])]
     if not is_reported:
         others = [place for place in others if place.score >= needed]
     better = _better(leading.places[0] if leading.places else None, others)
     if better is not None and not broken_hints(better, options):  # hints led past it
-        return found
-    spent_s = sum(result.match_s + result.refine_s for result in found)
+        return results
+    spent_s = sum(result.match_s + result.refine_s for result in results)
     return [
         replace(result, better=better, match_s=result.match_s + spent_s) if result is leading else result
         for result in hinted
@@ -85,11 +85,11 @@ def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:
         for place in others
         if _is_other(hinted, place)
     ]
-    worth, best = max(weighed, key=lambda pair: pair[0], default=(-math.inf, None))
+    likelihood, best = max(weighed, key=lambda pair: pair[0], default=(-math.inf, None))
     own = hinted.agreement.log10_likelihood
-    if best is None or worth < own + _MORE:
+    if best is None or likelihood < own + _MORE:
         return None
-    return best.but(score=worth - own, by=Weight(worth, hinted.but(by=None).statement_px))
+    return best.but(score=likelihood - own, by=Weight(likelihood, hinted.but(by=None).statement_px))
 
 
 def _is_other(hinted: Place, place: Place) -> bool:
