@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python examples/faulty_flights.py OUT.csv porto.gpkg liege.gpkg [--flights 3] [--seed 7]
 
-In each flight a frame is repeated, frames are missing, or the aircraft is displaced, for 3 to 8 frames; then the flight
+In each flight a frame is repeated, frames are missing, or the aircraft is displaced, for 3 to 7 frames; then the flight
 goes on. Counted are frames that lie farther from the truth than five standard deviations, the stage that first put
 one there, and flights whose last frames are placed rightly again. A row of each flight goes to OUT.csv.
 """
@@ -28,12 +28,12 @@ from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
 
 FAULTS = ("frozen", "missing", "slipped")
-#: As a video shows it: a frame moves by a twentieth of its height.
+#: As a video shows it: a frame moves by a fourteenth of its height.
 VIEWS = FlightOptions(
-    size_px=(800, 600),
-    n_frames=(36, 36),
-    overlap=0.95,
-    gsd_m=(0.7, 1.2),
+    size_px=(500, 400),
+    n_frames=(24, 24),
+    overlap=0.93,
+    gsd_m=(0.9, 1.3),
     turn_deg=0.5,
     sway_deg=0.2,
     intersections=(4, 60),
@@ -67,7 +67,7 @@ def draw(landscape: Landscape, options: FlightOptions, number: int, fault: str) 
     """Draw a flight with a fault; return it, the frame at which it fails, and for how many frames."""
     rng = np.random.default_rng([options.seed, number, FAULTS.index(fault)])
     for k in range(number, number + 100_000, 1000):
-        flight, at, length = simulate_flight(landscape, options, k), int(rng.integers(8, 16)), int(rng.integers(3, 9))
+        flight, at, length = simulate_flight(landscape, options, k), int(rng.integers(6, 12)), int(rng.integers(3, 8))
         faulty = with_fault(flight, fault, at, length)
         if all(landscape.covers(view.footprint) for view in faulty.views):
             return faulty, at, length

@@ -46,6 +46,9 @@ _FEWEST, _MORE, _MORE_FRAMES = 6, 2, 3
 #: share of its roads that agree by this: medians. At right places of 60 frames the part was .75 and more, and the share
 #: fell by up to .07; a frame's width beside, the part was at most .08, and the share fell by .45 and more.
 _N_BEFORE, _FALLEN, _SHARE_FALLEN = 5, 0.5, 0.15
+#: A block beside explains more than a frame's place if its log10 likelihood is greater by this. At 12 right places in a
+#: lattice none was greater at all; a block beside them, the true place's was greater by .4 to 6.
+_EXPLAINS_MORE = 0.5
 #: Length of road, pixels, that frame and map must each show for the map to tell anything of a frame.
 _LEAST_ROADS_PX = 100.0
 #: A frame is where the roads around put it, if they put it there to this, metres.
@@ -231,9 +234,10 @@ class Tracker:
         if scene is None or reference is None or not _shows_roads(predicted, scene, reference):
             return self._by_motion(Tracked(frame, "predicted", _HARDLY_A_ROAD, known_at, predicted, reference))
         corrected = correct(predicted, scene, reference.index.road_buckets, FilterOptions())
-        odds, agreeing = _compare(corrected or predicted, scene, reference)
+        odds, agreeing, beside = _compare(corrected or predicted, scene, reference)
         tracked = Tracked(frame, status, _AGREES, known_at, corrected, reference, odds, agreeing)
-        if corrected is not None and odds >= self.options.least_odds and not _falls(tracked, agreed):
+        is_doubtful = bool(agreed) and (beside > _EXPLAINS_MORE or _falls(tracked, agreed))
+        if corrected is not None and odds >= self.options.least_odds and not is_doubtful:
             self._pose = corrected
             return tracked
         around = self._search_around(waiting, predicted, known_at, agreed) if agreed else None
@@ -425,15 +429,26 @@ def _read(mosaic: Mosaic) -> Query | None:
         return None
 
 
-def _compare(pose: FramePose, scene: Scene, reference: Reference) -> tuple[float, float]:
-    """Return the log10 odds of a frame at its place against places nearby, and the share of its roads that agree."""
+def _compare(pose: FramePose, scene: Scene, reference: Reference) -> tuple[float, float, float]:
+    """Compare a frame at its place with the map.
+
+    Returns
+    -------
+    float
+        Its log10 odds against places nearby but for whole blocks: where streets are alike a block beside, by which a
+        search is judged, is no rival of a frame that was followed to its place.
+    float
+        The share of its roads that agree.
+    float
+        How much more the best place beside explains, a block beside or elsewhere nearby, log10.
+    """
     matrix = pose.homography.matrix @ PIXEL_TO_PLANE
-    # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
-    # rival: shifts that meet whole blocks are left out.
     evidence = Evidence(scene, reference.index, pose.gsd_m)
     agreement = evidence.agreement(matrix)
     nearby = max(evidence.nearby(matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)
-    return agreement.log10_likelihood - nearby, agreement.forward
+    beside = evidence.nearby(matrix, n_shifts=_N_SHIFTS)
+    own = agreement.log10_likelihood
+    return own - nearby, agreement.forward, beside - own
 
 
 def _falls(tracked: Tracked, agreed: Sequence[Tracked]) -> bool:
