@@ -37,6 +37,11 @@ FROM_CODE = [
     (SECTION_8, r"over the (\d+) m around is `pi`", picture._USUAL_M),
     (SECTION_8, r"(\d+) m of road count as one statement", picture._STATEMENT_M),
     (SECTION_8, r"within (\d+) km, in (\w+) turns", (rivals._REACHES_M[-1] / 1000.0, len(rivals._TURNS_DEG))),
+    (
+        SECTION_8,
+        r"So beyond 10\^(\d+) the lead is (\d+) times the part",
+        (picture._MOST_LIKELIHOOD, picture._MOST_LIKELIHOOD),
+    ),
     (SECTION_8, r"and (half) of the lesser one", rivals._AGREEING),
     (SECTION_8, r"or the blocks beside it, by 10\^(\d+) is", rivals._CERTAIN),
     (SECTION_8, r"met is less than (half) of the score needed", rivals._MAY_LEAD),
