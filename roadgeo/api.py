@@ -15,7 +15,7 @@ from roadgeo.errors import MaskError, name_package
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.matching.hints import HINTS, STATED, apply_hints, asked_of_camera, read_hint
+from roadgeo.matching.hints import HINTS, STATED, apply_hints, as_keywords, asked_of_camera, read_hint
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
 from roadgeo.reference.reference import BuildOptions, Reference
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
     import networkx as nx
 
+    from roadgeo._arrays import AnyArray
     from roadgeo.flights.rows import Row
+    from roadgeo.running.pictures import PilImage, RasterioDataset, XarrayArray
     from roadgeo.running.verifying import Verified
 
 __all__ = ["Answer", "fence", "index", "locate", "track", "vectorize", "verify"]
@@ -38,6 +40,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
+
+#: A file; or what other libraries hold: an array (also as nested lists), a PIL image, xarray's or rasterio's.
+Picture: TypeAlias = "str | os.PathLike[str] | AnyArray | list[Any] | PilImage | XarrayArray | RasterioDataset"
 
 #: A file or folder, or several.
 Files: TypeAlias = "str | os.PathLike[str] | Iterable[str | os.PathLike[str]]"
@@ -201,7 +206,7 @@ def _is_place(roads: Any) -> bool:
 
 @_hinted(Hints)
 def locate(
-    mask: Any,
+    mask: Picture | RoadMask,
     reference: References = (),
     options: LocateOptions | None = None,
     *,
@@ -259,16 +264,18 @@ def locate(
     if meant is not None:
         near = hints.get("near")
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
-    picture = None if isinstance(mask, RoadMask) else read_picture(mask)
-    if picture is None:
+    picture = None
+    if isinstance(mask, RoadMask):
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
+        picture = read_picture(mask)
         sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
     if take is not None:
         sighting = sighting.answering(take_place(sighting.location, take, options))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
     origin = {"options": changed, "reference_digest": digest_of(references, sighting.location.reference)}
     answer = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
+    answer["reason"] = as_keywords(sighting.location.reason)
     indexes = tuple(item.index_of(sighting.location) for item in references)
     picture = picture if sighting.of_photograph else None
     photo, pixels = (picture, None) if isinstance(picture, str) else (None, picture)
@@ -399,7 +406,7 @@ def track(
     return make_rows(tracked, start, _hint("focal", focal))
 
 
-def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = None) -> nx.MultiGraph:
+def vectorize(image: Picture, *, gsd: float | tuple[float, float] | str | None = None) -> nx.MultiGraph:
     """Return the roads that are seen in a mask or a photograph, as `roadgeo vectorize` shows them.
 
     >>> graph = roadgeo.vectorize("drone.png")

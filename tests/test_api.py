@@ -1,5 +1,6 @@
 """What Python programs call, with all that they may have at hand."""
 
+import inspect
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import roadgeo
 from roadgeo.api import _is_place
 from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS
+from roadgeo.matching.hints import as_keywords
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.triples import Sweep, TripleOptions
 from roadgeo.reference.files import reference_digest
@@ -219,3 +221,14 @@ def test_what_the_camera_states_is_a_hint(porto: roadgeo.Reference, tmp_path: Pa
     free = roadgeo.locate(tmp_path / "drone.jpg", porto, QUICK)
     assert free.located
     assert free.stated_offset_m == pytest.approx(2050, rel=0.2)
+
+
+def test_the_advice_of_a_refusal_names_keywords(porto: roadgeo.Reference) -> None:
+    refused = roadgeo.locate(DRONE, porto, QUICK, near=(-8.5, 41.0, 10.0))
+    assert "--" not in refused.reason
+    assert as_keywords("5 % (--gsd SIZE+-5%), or leave --max-tilt out") == '5 % (gsd="SIZE+-5%"), or leave max_tilt out'
+
+
+def test_what_is_no_picture_is_none_for_a_type_checker() -> None:
+    assert inspect.signature(roadgeo.locate).parameters["mask"].annotation == "Picture | RoadMask"
+    assert inspect.signature(roadgeo.vectorize).parameters["image"].annotation == "Picture"

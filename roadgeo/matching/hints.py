@@ -22,6 +22,7 @@ __all__ = [
     "Hint",
     "Taken",
     "apply_hints",
+    "as_keywords",
     "asked_of_camera",
     "read_box",
     "read_gsd",
@@ -299,6 +300,16 @@ def read_hint(name: str, value: Any) -> tuple[str, Any]:
 def asked_of_camera(hints: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of hints, by `Hint.goes_to`, that are to be what the camera states."""
     return tuple(name for name, value in hints.items() if value == STATED)
+
+
+def as_keywords(text: str) -> str:
+    """Return a text in which hints are named as keywords of Python, not as options of the command line."""
+    options = "|".join(hint.option for hint in HINTS.values())
+    return re.sub(
+        rf"({options})\b(?: ([A-Z][^\s)]*))?",
+        lambda named: named[1][2:].replace("-", "_") + (f'="{named[2]}"' if named[2] else ""),
+        text,
+    )
 
 
 def apply_hints(options: LocateOptions, hints: Mapping[str, Any]) -> LocateOptions:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from roadgeo.roads.thresholds import are_labels
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
-__all__ = ["as_file", "pixels_of", "read_picture"]
+__all__ = ["PilImage", "RasterioDataset", "XarrayArray", "as_file", "pixels_of", "read_picture"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,6 +31,36 @@ _COLUMNS = {"x", "column", "col"} | _DEGREES
 
 #: An axis no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
+
+
+class PilImage(Protocol):
+    """What is used of a PIL image."""
+
+    def getbands(self) -> tuple[str, ...]:
+        """Return the names of its bands."""
+
+
+class XarrayArray(Protocol):
+    """What is used of an xarray DataArray."""
+
+    @property
+    def dims(self) -> Any:
+        """Names of its axes."""
+
+    @property
+    def values(self) -> Any:
+        """Its array."""
+
+
+class RasterioDataset(Protocol):
+    """What is used of a rasterio dataset."""
+
+    @property
+    def name(self) -> str:
+        """Its file."""
+
+    def read_masks(self, *bands: Any, **how: Any) -> Any:
+        """Return where its bands are valid."""
 
 
 def read_picture(picture: Any) -> str | AnyArray:

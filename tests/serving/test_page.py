@@ -259,12 +259,14 @@ def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
     def refuse(mask, references, options):
         found = locate(mask, references, options)
         places = (found.place, moved(found.place, 900.0, 0.0, score=-1.0))
-        return replace(found, status="not_located", reason="no place", reason_code=Reason.FEW_ROADS, places=places)
+        reason = "no place; the heading to 5 degrees (--heading DEG+-5) would help"
+        return replace(found, status="not_located", reason=reason, reason_code=Reason.FEW_ROADS, places=places)
 
     monkeypatch.setattr("roadgeo.workflows.locate", refuse)
     give(page, mask, "far.png")
     wait_for(page, "Not located")
     expect(page.locator("#map .pin.place")).to_have_count(2)
+    expect(page.locator("#reason")).to_contain_text("5 degrees (“How it was held” below) would help")
     rows = page.locator("#places li button:not(.take)")
     expect(rows.nth(1)).to_contain_text(f"{workers.references[0].name}, ")
     expect(rows.nth(1)).to_contain_text("score -1.0")

@@ -174,7 +174,7 @@ function show(entry) {
   $("status").className = `status ${status}`;
   $("status").textContent = WORDS[status];
   $("progress").hidden = over;
-  $("reason").textContent = over ? sentence(entry.message) : "";
+  $("reason").textContent = over ? sentence(inFields(entry.message)) : "";
   showProgress(entry);
   showPicture(entry);
   $("facts").replaceChildren(...(sure ? facts(found, seen?.place?.matches ?? []) : []).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", {}, value)]));
@@ -232,6 +232,9 @@ function layPins() {
 }
 
 const megabytes = (bytes) => `${(bytes / 1e6).toFixed(0)} MB`;
+const FIELDS = { near: "It is about here", gsd: "How large a pixel is", heading: "How it was held" };
+/** Name the page's fields, not the command line's options. */
+const inFields = (text) => text.replace(/--([a-z]+)(?: [A-Z][^\s)]*)?/g, (option, name) => (FIELDS[name] ? `“${FIELDS[name]}” below` : option));
 const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 const degrees = ({ lat, lon }) => `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
 const length = (m) => (m < 1 ? `${(m * 100).toPrecision(2)} cm` : m < 10 ? `${m.toFixed(1)} m` : m < 1000 ? `${m.toFixed(0)} m` : `${(m / 1000).toFixed(1)} km`);
