@@ -317,7 +317,7 @@ def apply_hints(options: LocateOptions, hints: Mapping[str, Any]) -> LocateOptio
 
     Parameters
     ----------
-    known : mapping
+    hints : mapping
         Values by `Hint.goes_to`; None if unknown. The caller must look up what the camera states, "exif".
     """
     given = {name: value for name, value in hints.items() if value not in (None, STATED)}

@@ -10,6 +10,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.placement import Matches, Placement
+from roadgeo.geometry.transformation import LONLAT
 from roadgeo.location import Location
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.drawing.layers import rgb
@@ -48,7 +49,7 @@ def _layers(subject: Subject) -> list[FeatureTable]:
         FeatureTable("footprint", "POLYGON", [place.footprint], columns, place.crs, _FOOTPRINT_STYLE, text),
         *([] if matches is None else _match_layers(place, subject.graph, matches)),
         _corner_layer(place),
-        _alternative_layer(place, subject.location),
+        _alternative_layer(subject.location),
     ]
 
 
@@ -97,11 +98,12 @@ def _corner_layer(place: Placement) -> FeatureTable:
     return FeatureTable("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, summary)
 
 
-def _alternative_layer(place: Placement, location: Location) -> FeatureTable:
+def _alternative_layer(location: Location) -> FeatureTable:
     """Show where else the mask might lie."""
     others = location.alternatives
-    values = np.array([(*other.center_in(place.crs), other.score) for other in others], float).reshape(-1, 5)
-    columns = dict(zip(("lon", "lat", "log10_odds"), values.T[2:], strict=True))
+    values = np.array([(*other.center[2:], other.score) for other in others], float).reshape(-1, 3)
+    columns = dict(zip(("lon", "lat", "log10_odds"), values.T, strict=True))
     columns = {"rank": np.arange(2, 2 + len(others)), **columns}
     text = "Middles of the best other places, with their scores"
-    return FeatureTable("alternatives", "POINT", values[:, :2], columns, place.crs, _ALTERNATIVES_STYLE, text)
+    # In degrees, for they may lie on other maps.
+    return FeatureTable("alternatives", "POINT", values[:, :2], columns, LONLAT, _ALTERNATIVES_STYLE, text)

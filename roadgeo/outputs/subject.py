@@ -231,12 +231,15 @@ class Subject:
         return Matches(matches.query_xy[first], matches.reference_xy[first], matches.residual_m[first])
 
     def runner_up(self) -> FloatArray | None:
-        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
+        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had.
+
+        None where it lies on another map.
+        """
         location = self.location
         other = location.runner_up if self.has_place else next(iter(location.alternatives), None)
-        if other is None:
+        if other is None or other.reference != location.reference:
             return None
-        return np.array(other.center_in(self.location.crs or other.crs)[:2])
+        return np.array(other.center_in(location.crs or other.crs)[:2])
 
     @cached_property
     def target(self) -> Target:

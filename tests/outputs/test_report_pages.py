@@ -22,6 +22,7 @@ from roadgeo.evaluation.demo import ATTRIBUTION
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.geometry.placement import Matches
+from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Location, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
@@ -64,6 +65,12 @@ def rival(location: Location, dx: float = 400.0, dy: float = 400.0) -> Location:
     """The same with a runner-up somewhere else."""
     assert location.place is not None
     return with_place(location, score=8.5, rival=moved(location.place, dx, dy, score=7.5))
+
+
+def on_another_map(location: Location) -> Location:
+    """The same, its runner-up on a map whose zone is another."""
+    other = replace(location.place.rival, plane=LocalPlane("EPSG:32632", (597000.0, 6642000.0)), reference="Oslo")
+    return with_place(location, rival=other)
 
 
 def render_report(
@@ -170,6 +177,9 @@ def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Loc
     unsure = render_report(with_place(location, score=-0.4), drone, porto.index)
     assert "to the north-east, about as likely" in Reader(unsure).text
     assert page.count('<g class="runner-up"') == 2  # around the footprint, and on the whole map
+    elsewhere = Reader(render_report(on_another_map(location), drone, porto.index)).text
+    assert "km to the" in elsewhere
+    assert ", on the map Oslo, 10^8 times less likely" in elsewhere
     far = render_report(rival(location, -30_000.0, 0.0), drone, porto.index)
     assert "30 km to the west" in far
     assert far.count('<g class="runner-up"') == 1

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from pyproj import Geod
 
 from roadgeo._text import counted, in_html
 from roadgeo._version import __version__
@@ -206,7 +207,7 @@ def _draw_overview(subject: Subject) -> str:
     layers = [picture]
     if subject.has_place:
         layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
-    rings = [place.footprint_lonlat for place in location.alternatives]
+    rings = [place.footprint_lonlat for place in location.alternatives if place.reference in ("", index.name)]
     grounds = [transform("EPSG:4326", index.plane.crs, ring) for ring in rings]
     others: list[Cross | Ring] = [Ring(window.place(ground)) for ground in grounds if np.isfinite(ground).all()]
     middle = subject.runner_up()
@@ -272,9 +273,12 @@ def _listed(places: Sequence[Placement]) -> str:
     """List the best places of a refusal with their scores: HTML."""
     if not places:
         return ""
-    scores = [min(place.score, places[0].score) for place in places]
+    several = len({place.reference for place in places}) > 1
     lines = [
-        f"{n}. {_link(places[n - 1].center)} <small>score {score:.1f}</small>" for n, score in enumerate(scores, 1)
+        f"{n}. {_link(place.center)} <small>score {min(place.score, places[0].score):.1f}"
+        + (f", on the map {in_html(place.reference)}" if several else "")
+        + f", {in_html(place.crs) if place.crs.startswith('EPSG:') else 'a plane of its own'}</small>"
+        for n, place in enumerate(places, 1)
     ]
     return "<br>".join(["The best places that it had, though not sure enough:", *lines, _TAKING])
 
@@ -286,10 +290,9 @@ def _rival(location: Location) -> str:
         return ""
     if other is None:
         return "No other place came close."
-    x, y = other.center_in(str(location.crs))[:2]
-    apart = math.hypot(x - center.x, y - center.y)
-    wind = _WINDS[round(math.degrees(math.atan2(x - center.x, y - center.y)) / 45.0) % 8]
-    way = f"{write_distance(apart)} to the {wind}"
+    azimuth, _, apart = Geod(ellps="WGS84").inv(center.lon, center.lat, other.center.lon, other.center.lat)
+    way = f"{write_distance(apart)} to the {_WINDS[round(azimuth / 45.0) % 8]}"
+    way += "" if other.reference == location.reference else f", on the map {in_html(other.reference)}"
     return f"The best other place lies {way}, {write_lead(location.log10_odds)}: {_link(other.center)}"
 
 
