@@ -94,6 +94,7 @@ FROM_PAGES = [
         r"blind \| (\d+) of (\d+) \((\d+) to (\d+) %\)",
     ),
     ("README.md", r"(\w+) of ([\d,]+) masks without", "docs/how-well.md", r"\*\*(\w+) of ([\d,]+) masks without"),
+    ("README.md", r"later and ([\d.]+) GB of disk", "docs/install.md", r"It takes about ([\d.]+) GB of disk"),
 ]
 
 
