@@ -60,8 +60,8 @@ _LEADING = 2.0
 #: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
 #: Intersections of a place, those with the rarest tuples first, that are looked up elsewhere on the map before it is
-#: accepted; and how.
-_N_EQUALS, _OWN_TUPLES = 6, TripleOptions()
+#: accepted; how; and the part of their neighbours there that an equal place has at least.
+_N_EQUALS, _OWN_TUPLES, _EQUAL = 12, TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
 #: by roads, and comparing a hypothesis with the map, plus the time for each road point.
@@ -286,7 +286,10 @@ class TripleEstimator:
                 yield place
 
     def look_for_equals(self, place: Place) -> None:
-        """Verify where else on the map a place's own tuples fit, at any turn and scale; once for each place."""
+        """Verify where else on the map a place's own tuples fit, at any turn and scale; once for each place.
+
+        They are refined to the end: an equal place that grew from few intersections explains little at first.
+        """
         if any(other.same(place) for other in self._equals_of):
             return
         self._equals_of.append(place)
@@ -295,11 +298,13 @@ class TripleEstimator:
         args = self.scene, [self.index], scale, camera.min_shape_ratio, _OWN_TUPLES
         anchors = propose(*args, self.sweeps.ahead, np.flatnonzero(there >= 0))
         for (proposals,) in islice(anchors, _N_EQUALS):
-            elsewhere = self.allow(proposals) & (proposals.reference != there[proposals.anchor])
+            is_own = proposals.reference == there[proposals.anchor]
+            placed = _EQUAL * int(proposals.placed[is_own].max(initial=0))
+            elsewhere = self.allow(proposals) & ~is_own & (proposals.placed >= placed)
             kept = self.screen(proposals, elsewhere, MAX_SCREENED)
             for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
                 if not other.same(place):
-                    self.settle(other)
+                    self.verified.append(self.refine_whole(self.settle(other)[0]))
 
     def settle(self, place: Place) -> tuple[Place, float]:
         """Return a place refined, and its score: its lead over the places that were met, and over those nearby."""
