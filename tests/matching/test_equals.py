@@ -45,7 +45,7 @@ def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
     place, _ = estimator.settle(Place(query.scene, index, TRUTH))
     estimator.look_for_equals(place)
     assert any(np.hypot(*(other.center - there)) < 5.0 for other in estimator.verified)
-    assert estimator.n_anchors == 6
+    assert estimator.n_anchors == 12
     n_verified = estimator.n_verified
     estimator.look_for_equals(place)
     assert estimator.n_verified == n_verified
