@@ -64,6 +64,7 @@ print(seen, shown[-1:])
 @pytest.mark.parametrize(
     ("program", "compiled_here"),
     [(sys.executable, []), ("qgis", ["buckets", "road_rings"]), ("qgis-bin.exe", ["buckets", "road_rings"])],
+    ids=["python", "qgis", "qgis-bin"],
 )
 def test_processes_of_their_own_compile_where_they_can(program: str, compiled_here: list[str], tmp_path: Path) -> None:
     environ = {**os.environ, "ROADGEO_CACHE": str(tmp_path)}
