@@ -17,7 +17,7 @@ __all__ = ["apply_command"]
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Apply:
-    """What `roadgeo apply` is asked."""
+    """The parameters of `roadgeo apply`."""
 
     location: str = argument("LOCATION.json")
     pictures: tuple[str, ...] = argument("PICTURE...", many=True)

@@ -15,7 +15,7 @@ __all__ = ["completion_command"]
 
 @dataclass(frozen=True, kw_only=True)
 class Completion:
-    """What `roadgeo completion` is asked."""
+    """The parameters of `roadgeo completion`."""
 
     shell: str = argument("SHELL", type=click.Choice(["bash", "zsh", "fish"]), metavar=None)
 

@@ -22,7 +22,7 @@ __all__ = ["demo_command"]
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """What `roadgeo demo` is asked."""
+    """The parameters of `roadgeo demo`."""
 
     out_dir: str = take(Shared, "out_dir", help="Where everything is written; made if missing.",
         default="roadgeo_demo", show_default=True)  # fmt: skip

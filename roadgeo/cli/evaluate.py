@@ -36,7 +36,7 @@ __all__ = ["evaluate_command"]
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """What `roadgeo evaluate` is asked."""
+    """The parameters of `roadgeo evaluate`."""
 
     reference: str = argument("REF", type=None)
     queries: Path | None = option("--queries", "PATH", OTHERS, "A query set: its folder, or its table.",

@@ -33,7 +33,7 @@ SOURCE, ROADS, RESULT, PIECES = "Where the roads come from", "Which roads", "The
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Index:
-    """What `roadgeo index` is asked."""
+    """The parameters of `roadgeo index`."""
 
     place: str | None = option("--osm", "PLACE", SOURCE, "Fetch the roads of a place from OpenStreetMap.")
     bbox: Box | None = option("--bbox", "W,S,E,N", SOURCE, "Fetch those in a box, degrees; or cut --roads to it.",

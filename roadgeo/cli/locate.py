@@ -117,7 +117,7 @@ def _more() -> str:
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Locate:
-    """What `roadgeo locate` is asked."""
+    """The parameters of `roadgeo locate`."""
 
     masks: tuple[str, ...] = argument("IMAGE...", many=True)
     references: tuple[str, ...] = take(Shared, "references")

@@ -30,7 +30,7 @@ def qgis_command() -> None:
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Install:
-    """What `roadgeo qgis install` is asked."""
+    """The parameters of `roadgeo qgis install`."""
 
     profile: str = option("--profile", "PROFILE", OTHERS,
         "A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
@@ -39,7 +39,7 @@ class Install:
 
 @dataclass(frozen=True, kw_only=True)
 class Package:
-    """What `roadgeo qgis package` is asked."""
+    """The parameters of `roadgeo qgis package`."""
 
     out: str | None = option("-o --out", "FILE", OTHERS, "The package. Default: roadgeo_qgis-VERSION.zip.",
         type=click.Path(dir_okay=False))

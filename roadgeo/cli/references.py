@@ -37,7 +37,7 @@ def reference_command() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """What `roadgeo reference info` is asked."""
+    """The parameters of `roadgeo reference info`."""
 
     reference: str = argument("REF")
     as_json: bool = take(Shared, "as_json", help="Print everything that is known as one JSON object.", group=OTHERS)
@@ -82,7 +82,7 @@ def list_plugins() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """What `roadgeo reference check` is asked."""
+    """The parameters of `roadgeo reference check`."""
 
     references: tuple[str, ...] = argument("REF...", many=True)
 
@@ -120,7 +120,7 @@ def check_command(asked: Check) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """What `roadgeo reference list` is asked."""
+    """The parameters of `roadgeo reference list`."""
 
     as_json: bool = take(Shared, "as_json", help="Print one JSON object per reference and line.", group=OTHERS)
 
@@ -159,7 +159,7 @@ def list_command(_: List) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Remove:
-    """What `roadgeo reference remove` is asked."""
+    """The parameters of `roadgeo reference remove`."""
 
     names: tuple[str, ...] = argument("NAME...", many=True, type=None)
     yes: bool = option("-y --yes", "", OTHERS, "Do not ask.")

@@ -78,7 +78,7 @@ def _help() -> str:
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Serve:
-    """What `roadgeo serve` is asked."""
+    """The parameters of `roadgeo serve`."""
 
     references: tuple[str, ...] = take(Shared, "references")
     limits: ServeOptions = part(ServeOptions)

@@ -17,7 +17,7 @@ __all__ = ["simulate_command"]
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """What `roadgeo simulate` is asked."""
+    """The parameters of `roadgeo simulate`."""
 
     reference: str = argument("REF", type=None)
     out_dir: str = take(Shared, "out_dir", help="Where to write.", default=None, required=True)

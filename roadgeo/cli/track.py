@@ -89,7 +89,7 @@ def _read_time(text: str) -> datetime:
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """What `roadgeo track` is asked."""
+    """The parameters of `roadgeo track`."""
 
     frames: tuple[str, ...] = argument("FRAMES...", many=True)
     references: tuple[str, ...] = take(Shared, "references")

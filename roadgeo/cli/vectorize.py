@@ -23,7 +23,7 @@ __all__ = ["vectorize_command"]
 
 @dataclass(frozen=True, kw_only=True)
 class Vectorize:
-    """What `roadgeo vectorize` is asked."""
+    """The parameters of `roadgeo vectorize`."""
 
     images: tuple[str, ...] = argument("IMAGE...", many=True)
     out_dir: str = take(Shared, "out_dir")

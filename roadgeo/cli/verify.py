@@ -33,7 +33,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """What `roadgeo verify` is asked."""
+    """The parameters of `roadgeo verify`."""
 
     images: tuple[str, ...] = argument("IMAGE...", many=True)
     references: tuple[str, ...] = take(Shared, "references",

@@ -80,7 +80,7 @@ class PairOptions(TupleOptions):
     rarest_first : bool
         Draw query tuples of types rare in the reference first (section 3.3). False: all types alike.
     refined : bool
-        Fit the homography of a place to all its matches. False: it is that of the tuple, by eq. 9.
+        Fit the homography of a place to all its matches. False: the homography of the tuple, by eq. 9, stays.
     work_limit_s, time_limit_s : float
         The search stops after this amount of work, counted in seconds of a usual machine, or this time by the clock.
     """
@@ -101,7 +101,7 @@ class PairOptions(TupleOptions):
 
     @property
     def tuples(self) -> TupleOptions:
-        """Those of its options that determine a reference's tuples."""
+        """The options that determine a reference's tuples."""
         return TupleOptions(**{option.name: getattr(self, option.name) for option in fields(TupleOptions)})
 
 

@@ -14,7 +14,7 @@ __all__ = ["ImageOptions"]
 # fmt: off
 @dataclass(frozen=True)
 class ImageOptions:
-    """How a picture is drawn on the map; what each option means stands beside it."""
+    """How a picture is drawn on the map; each option is explained beside it."""
 
     crs: str | None = option("--crs", "CRS", RESULTS,
         "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.", read=name_crs)

@@ -38,7 +38,7 @@ def read_bands(text: str) -> tuple[int, ...]:
 # fmt: off
 @dataclass(frozen=True)
 class ReadOptions:
-    """How an image is read; what each option means stands beside it.
+    """How an image is read; each option is explained beside it.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ def _usual_outputs() -> OutputOptions:
 # fmt: off
 @dataclass(frozen=True)
 class BatchOptions:
-    """The work done for every mask of a batch; what each option means stands beside it.
+    """The work done for every mask of a batch; each option is explained beside it.
 
     Attributes
     ----------

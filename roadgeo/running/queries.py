@@ -72,7 +72,7 @@ def locate_query(
 
 @dataclass(frozen=True)
 class OpenQuery:
-    """A path or an array, and what it holds.
+    """A path or an array, and the kind of its content.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class OpenQuery:
 
 @contextmanager
 def open_query(path: str | AnyArray, reading: ReadOptions) -> Iterator[OpenQuery]:
-    """Look what a path or an array holds: roads as lines by its ending, a mask or a photograph by its values.
+    """Look into a path or an array: roads as lines by its ending, a mask or a photograph by its values.
 
     Raises
     ------

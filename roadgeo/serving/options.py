@@ -29,7 +29,7 @@ def _read_basemap(url: str) -> str:
 # fmt: off
 @dataclass(frozen=True)
 class ServeOptions:
-    """Limits and settings of the server; what each option means stands beside it.
+    """Limits and settings of the server; each option is explained beside it.
 
     Attributes
     ----------
