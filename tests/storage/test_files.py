@@ -29,6 +29,15 @@ def write_twice(tmp_path: Path, message: str) -> None:
     assert list(tmp_path.iterdir()) == [target]
 
 
+def test_content_is_on_the_disk_before_its_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a power cut the name stands for the old content or the new."""
+    steps, sync, rename = [], os.fsync, files._rename
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (steps.append("sync"), sync(descriptor)))
+    monkeypatch.setattr(files, "_rename", lambda *paths: (steps.append("rename"), rename(*paths)))
+    write_text(tmp_path / "a.txt", "content")
+    assert steps == ["sync", "rename", "sync"]
+
+
 def test_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(errno.EPERM, "no hard links")
