@@ -116,6 +116,24 @@ def test_frames_are_followed_where_a_block_beside_would_do_as_well(blocks):
     assert statuses.count("located") >= 10, statuses
 
 
+def test_a_frame_is_not_followed_to_a_block_beside_its_place(blocks):
+    """Its roads agree there nearly as well, but the true place explains more."""
+    flown, reference = blocks
+    masks, placed = [RoadMask(mask > 127) for mask in flown.masks()], []
+    for k in range(1, len(masks)):
+        before, view = flown.views[k - 1], flown.views[k]
+        tracker, frame = Tracker([reference]), FlightFrame(k, str(k), float(k), masks[k], flown.motion[k])
+        pose = start(before.homography(frame.frame.corners) + (110.0, 0.0), frame.frame, 2.0 * np.eye(8))
+        agreed = Tracked(replace(frame, number=k - 1), "tracked", "", k - 1, pose, reference, 0.0, 0.0)
+        tracker._pose, tracker._reference, tracker._agreed = pose, reference, [agreed]
+        (state,) = tracker.feed(frame)
+        placed.append(
+            state.pose is None
+            or np.hypot(*(state.pose.center - view.homography(frame.frame.center))) < 5.0 * state.pose.sigma_m
+        )
+    assert np.mean(placed) > 0.8
+
+
 def test_a_frame_that_the_mosaic_bends_away_is_placed_from_its_neighbour(flight, monkeypatch):
     flown, frames, reference = flight
     settle = Tracker._settle
