@@ -59,7 +59,6 @@ class Result:
     worst_m: float
     worst_sigma_m: float
     stage: str
-    noticed: bool
     found_again: bool
 
 
@@ -110,11 +109,10 @@ def measure(path: Path, landscape: Landscape, options: FlightOptions, number: in
     stage, _, _ = wrong[0] if wrong else ("", 0.0, 0.0)
     _, worst_m, sigma_m = max(wrong, key=lambda frame: frame[1], default=("", 0.0, 0.0))
     placed = sum(np.isfinite(error) for _, error, _ in frames)
-    noticed = any(state.status in ("lost", "predicted") for state in tracked[at:])
     found_again = sum(not stage and error < RIGHT_M for stage, error, _ in frames[-LAST:]) >= LAST / 2
     return Result(
         path.stem, number, fault, at, length, len(frames), placed,
-        len(wrong), round(worst_m, 1), round(sigma_m, 2), stage, noticed, found_again,
+        len(wrong), round(worst_m, 1), round(sigma_m, 2), stage, found_again,
     )  # fmt: skip
 
 
@@ -126,7 +124,6 @@ def summarize(results: Sequence[Result]) -> None:
         print(
             f"{fault:8} {len(here)} flights: {sum(result.wrong > 0 for result in here)} with wrong frames"
             f" ({sum(result.wrong for result in here)}; the first by {stages}),"
-            f" {sum(result.noticed for result in here)} noticed,"
             f" {sum(result.found_again for result in here)} found again"
         )
 

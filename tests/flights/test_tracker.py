@@ -123,7 +123,7 @@ def test_a_frame_is_not_followed_to_a_block_beside_its_place(blocks):
     for k in range(1, len(masks)):
         before, view = flown.views[k - 1], flown.views[k]
         tracker, frame = Tracker([reference]), FlightFrame(k, str(k), float(k), masks[k], flown.motion[k])
-        pose = start(before.homography(frame.frame.corners) + (110.0, 0.0), frame.frame, 2.0 * np.eye(8))
+        pose = start(before.homography(frame.frame.corners) + np.array([110.0, 0.0]), frame.frame, 2.0 * np.eye(8))
         agreed = Tracked(replace(frame, number=k - 1), "tracked", "", k - 1, pose, reference, 0.0, 0.0)
         tracker._pose, tracker._reference, tracker._agreed = pose, reference, [agreed]
         (state,) = tracker.feed(frame)
