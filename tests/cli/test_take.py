@@ -42,7 +42,7 @@ def test_a_refusal_lists_distinct_places_with_footprints_the_best_first(refused)
 
 
 def test_a_refusal_shows_the_places_by_their_numbers(porto, refused, capfd):
-    assert main(["locate", PATHS["elsewhere"], "-r", str(porto)]) == 3
+    assert main([*LOCATE, "-r", str(porto)]) == 3
     (listed,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("  best places, 1: ")]
     second = refused.alternatives[1]
     assert f", 2: {format_lonlat(*second.center[2:])}, 3: " in listed
