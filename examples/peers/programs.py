@@ -40,7 +40,16 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "programs.csv"
 #: Names that OpenCV 3 had, and libraries.
 HEADERS = ("imgproc/types_c.h", "calib3d/calib3d_c.h", "highgui/highgui_c.h", "imgcodecs/legacy/constants_c.h")
-LIBRARIES = ("opencv_core", "opencv_imgproc", "opencv_imgcodecs", "opencv_highgui", "opencv_calib3d", "shp", "glog")
+LIBRARIES = (
+    "opencv_core",
+    "opencv_imgproc",
+    "opencv_imgcodecs",
+    "opencv_highgui",
+    "opencv_calib3d",
+    "opencv_flann",
+    "shp",
+    "glog",
+)
 #: Inliers and relative error of the cross ratio: as shipped, and the paper's.
 PARAMETERS = {"def": ("0.6", "0.2"), "paper": ("0.5", "0.3")}
 #: Version 1 adds this to y, metres.
