@@ -25,7 +25,7 @@ OPTIONS, START_M = FlightOptions(n_frames=(19, 19), gsd_m=(0.5, 0.5)), 0.3
 #: and both skews, as of ground that is no plane.
 N, HEIGHT, HEADING, TILT, FOCAL, SKEWS = 9, slice(2, 3), slice(3, 4), slice(4, 6), slice(6, 7), slice(7, 9)
 EXACT = 1e-7
-#: Standard deviations of the first focal length, its change between frames, and of what else is known.
+#: Standard deviations of the first focal length, its change between frames, and of the other parameters.
 CASES = {
     "the filter's model: focal length unknown, skews .005": {"focal": 0.45, "refocusing": 0.002, "skews": 0.005},
     "the same, skews .002": {"focal": 0.45, "refocusing": 0.002, "skews": 0.002},

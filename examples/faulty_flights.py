@@ -46,7 +46,7 @@ LAST, RIGHT_M = 6, 50.0
 
 @dataclass(frozen=True)
 class Result:
-    """The outcome of one flight; `stage`: what first went wrong, "" for nothing."""
+    """The outcome of one flight; `stage` where it first went wrong, or ""."""
 
     city: str
     number: int

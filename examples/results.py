@@ -1,4 +1,4 @@
-"""Results as a CSV file with a row for each case, and their counts: what several examples write and read."""
+"""Results as a CSV file with a row for each case, and their counts, for several examples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks among many maps, false hints, repeated districts and mirrored blocks: what is easy alone, in company.
+"""Masks among many maps, false hints, repeated districts and mirrored blocks: easy masks, in company.
 
     export ROADGEO_DATA=/path/to/development/data     (the atlas of 33 cities)
     python examples/company/company.py shards         masks of five cities, on the atlas in shards

@@ -38,7 +38,7 @@ from roadgeo.workflows import LocateOptions, locate
 
 #: Section 4.3: "an area of 10 x 10 km2".
 AREA_M = 10_000.0
-#: The paper to the letter; what `--method pair` does; roadgeo's own.
+#: The paper to the letter; the steps of `--method pair`; roadgeo's own.
 METHODS = {
     "paper": LocateOptions(method="pair", pair=PAPER),
     "pair": LocateOptions(method="pair"),
@@ -49,7 +49,7 @@ COLORS = {"paper": "C3", "pair": "C1", "auto": "C0"}
 
 @dataclass(frozen=True)
 class Setting:
-    """What all experiments share.
+    """The settings that all experiments share.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ def point(found: Evaluation) -> dict[str, Any]:
 
 
 def save(setting: Setting, name: str, results: dict[str, Any]) -> None:
-    """Write results as JSON, with what they were made of."""
+    """Write results as JSON, with their conditions."""
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     about = {name: getattr(setting, name) for name in ("queries", "perspectives", "seed", "work_limit_s")}

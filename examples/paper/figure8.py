@@ -1,6 +1,6 @@
 """Figure 8: run time under different cross-ratio errors, clean masks of scenes of 1.5 x 1.5 km.
 
-As the paper's, times are those of the search: tracing the mask is left out. They are counted, in seconds of a usual
+As in the paper, times are of the search: tracing the mask is left out. They are counted, in seconds of a usual
 machine, so that they do not depend on the load.
 """
 

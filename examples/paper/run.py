@@ -26,7 +26,7 @@ EXPERIMENTS = ("figure5", "figure6", "figure7", "figure8", "tables")
 
 
 def main() -> int:
-    """Look for what is needed, and run the experiments."""
+    """Check that all inputs exist, and run the experiments."""
     options = _arguments().parse_args()
     missing = _missing(options)
     if missing:

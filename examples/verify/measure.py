@@ -42,7 +42,7 @@ WRONG_M = 10.0
 
 @dataclass(frozen=True)
 class Trial:
-    """A mask, and what was said of it; `off_m` -1: it is from elsewhere."""
+    """A mask, and its verdict; `off_m` -1: it is from elsewhere."""
 
     city: str
     k: int

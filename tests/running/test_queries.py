@@ -90,7 +90,7 @@ def test_the_second_pass_shows_the_photograph_more_ways(
     taken: list[str] = []
 
     def note(passes, *_):  # type: ignore[no-untyped-def]
-        taken.extend(one.note for one in passes if one.rank == 0)
+        taken.extend(each.note for each in passes if each.rank == 0)
         raise MaskError("that is all")
 
     monkeypatch.setattr(photographs, "locate_passes", note)
@@ -144,10 +144,10 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
     taken: list[str] = []
 
     def take(passes, see, *_):  # type: ignore[no-untyped-def]
-        for one in passes:
-            taken.append(f"{one.rank}{one.note}")
+        for each in passes:
+            taken.append(f"{each.rank}{each.note}")
             with suppress(MaskError):
-                see(one)
+                see(each)
         raise MaskError("that is all")
 
     monkeypatch.setattr(photographs, "locate_passes", take)
@@ -167,9 +167,9 @@ def test_a_scale_that_was_tried_alone_is_not_shown_finer(
     monkeypatch.setattr(photographs, "rank_scales", lambda *_: dict.fromkeys((0.5, 0.25, 0.125), NOTHING))
     reading = ReadOptions(segment="always")
     with photographs.open_segmented(str(photo), reading, (0.0, np.inf), lambda *_: None) as segmented:
-        for one in segmented.passes():
+        for each in segmented.passes():
             with suppress(MaskError):
-                segmented.roads(one)
+                segmented.roads(each)
     photographs.load_model.cache_clear()
     assert not shown
 
