@@ -74,6 +74,7 @@ def locate(
     mask: RoadMask | AnyArray | str | Path,
     reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None = None,
+    say: Say = say_nothing,
 ) -> Location:
     """Find where a road mask lies on one of the references.
 
@@ -84,7 +85,7 @@ def locate(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    query, results, options = _search(mask, reference, options)
+    query, results, options = _search(mask, reference, options, say)
     return decide(query, results, options)
 
 
@@ -92,6 +93,7 @@ def explain(
     mask: RoadMask | AnyArray | str | Path,
     reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None = None,
+    say: Say = say_nothing,
 ) -> Explanation:
     """Locate a mask as `locate` does, and explain how far the search got, what it rejected and what was missing.
 
@@ -105,7 +107,7 @@ def explain(
     MaskError
         The mask cannot be read or shows no roads.
     """
-    query, results, options = _search(mask, reference, options, explained=True)
+    query, results, options = _search(mask, reference, options, say, explained=True)
     stories = tuple(tell(query, one, options) for one in results)
     return Explanation(decide(query, results, options), query.scene, query.graph, stories)
 
@@ -114,6 +116,7 @@ def _search(
     mask: RoadMask | AnyArray | str | Path,
     reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None,
+    say: Say,
     explained: bool = False,
 ) -> tuple[Query, list[Searched], LocateOptions]:
     """Trace a mask, and search all references together for it, within the time that tracing left."""
@@ -125,6 +128,8 @@ def _search(
     query = read_query(mask)
     left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
     parts = [part for one in references for part in one.parts]
-    searched = search_references(query, parts, options, left, explained)
+    if len(references) > 1:
+        say(f"searching {len(references)} maps together")
+    searched = search_references(query, parts, options, left, explained, say=say)
     spent_s = sum(one.match_s + one.refine_s for one in searched)
     return query, contest(query, searched, parts, options, max(left - spent_s, 0.0)), options

@@ -300,14 +300,11 @@ def _report(outcome: Outcome, single: bool) -> None:
 def _list_places(document: dict[str, Any]) -> None:
     """Print the places that a refusal knows, by the numbers that --take has for them."""
     places = [*([document] if document["center"] else []), *document["alternatives"]]
-    several = len({place["reference"] for place in places}) > 1
     if places:
-        listed = ", ".join(
-            f"{n}: {format_lonlat(place['center']['lon'], place['center']['lat'])}"
-            + (f" on {visible(place['reference'])}" if several else "")
-            for n, place in enumerate(places, 1)
-        )
-        tell(f"  best places, {listed}; where you know one to be right, --take its number")
+        tell("  best places; where you know one to be right, --take its number:")
+    for n, place in enumerate(places, 1):
+        where = format_lonlat(place["center"]["lon"], place["center"]["lat"])
+        tell(f"    {n}: {where} on {visible(place['reference'])}, score {place['log10_odds']:z.1f}")
 
 
 def _details(document: dict[str, Any]) -> str:

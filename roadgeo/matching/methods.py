@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TypeAlias
@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo._progress import Say, say_nothing
 from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
@@ -109,6 +110,7 @@ def search_references(
     time_limit_s: float,
     explained: bool = False,
     proposed: Sequence[Proposed] = (),
+    say: Say = say_nothing,
 ) -> list[Searched]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
@@ -119,13 +121,15 @@ def search_references(
     coarse, fine = _split(parts, options)
     with Ahead(options.threads) as ahead:
         if not coarse or not fine or options.method == "pair":
-            return _search(query, coarse + fine, options, time_limit_s, explained, ahead, proposed)
+            return _search(query, coarse + fine, options, time_limit_s, explained, ahead, proposed, say)
         started = time.perf_counter()
-        first = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead, proposed)
+        quick = _at_first_look(coarse, options)
+        first = _search(query, coarse, quick, time_limit_s, explained, ahead, proposed, say)
         if any(result.stopped == "accepted" for result in first):
             return first
         spent_s = time.perf_counter() - started
-        begun, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead, proposed)
+        left_s = time_limit_s - spent_s
+        begun, *others = _search(query, coarse + fine, options, left_s, explained, ahead, proposed, say)
         return [replace(begun, match_s=begun.match_s + spent_s), *others]
 
 
@@ -154,6 +158,7 @@ def _search(
     explained: bool,
     ahead: Ahead,
     proposed: Sequence[Proposed],
+    say: Say,
 ) -> list[Searched]:
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
@@ -186,7 +191,7 @@ def _search(
     sweeps.end()
     if units > 1 and not any(search.stopped in ("accepted", "time") for search in estimators):
         left, scale = left - (time.perf_counter() - started), float(units)
-        estimators = _search_alone(together, options, ledger, left, ahead)
+        estimators = _search_alone(together, options, ledger, left, ahead, say)
         rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     searches = iter(estimators)
     return [
@@ -196,7 +201,12 @@ def _search(
 
 
 def _search_alone(
-    estimators: Sequence[TripleEstimator], options: LocateOptions, ledger: Ledger, time_limit_s: float, ahead: Ahead
+    estimators: Sequence[TripleEstimator],
+    options: LocateOptions,
+    ledger: Ledger,
+    time_limit_s: float,
+    ahead: Ahead,
+    say: Say,
 ) -> dict[Search[Place], TripleEstimator]:
     """Search each part, and each unit of it, as if it were alone: leads compete, each on its own part.
 
@@ -210,10 +220,24 @@ def _search_alone(
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
     work_s = options.search.work_limit_s * sum(n_units(len(estimator.index)) for estimator in estimators)
     limits = replace(options.search, time_limit_s=time_limit_s, work_limit_s=work_s)
-    search_together(list(searches), limits, rivals.leading)
+    search_together(list(searches), limits, rivals.leading, _name_maps(searches, say))
     for estimator in estimators:
         estimator.sweeps.end()
     return searches
+
+
+def _name_maps(searches: Mapping[Search[Place], TripleEstimator], say: Say) -> Callable[[Search[Place]], None]:
+    """Return a function that says how many of several maps have had a turn, when the next one has its first."""
+    names = list(dict.fromkeys(estimator.index.name for estimator in searches.values()))  # shards bear one name
+    begun: set[str] = set()
+
+    def hear(search: Search[Place]) -> None:
+        name = searches[search].index.name
+        if len(names) > 1 and name not in begun:
+            begun.add(name)
+            say(f"searching each map alone, map {len(begun)} of {len(names)}")
+
+    return hear
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:

@@ -138,14 +138,16 @@ def search_together(
     parts: Sequence[Search[Model]],
     options: SearchOptions | None = None,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None = None,
+    heard: Callable[[Search[Model]], None] = lambda _: None,
 ) -> None:
     """Search many parts until an answer stands out on all parts, they are exhausted, or a limit is reached.
 
     Each part does a round in turn, stage after stage: the hypotheses of a sample of the query are met on all parts
     before an answer is accepted. `proves` returns the part whose answer stands out from all others, or None. It is
     called when an answer reaches `SearchOptions.accept`, which is enough without it, and at the end of each stage.
+    `heard` is called with each part before its round.
     """
-    ended_by = _search(parts, options or SearchOptions(), proves)
+    ended_by = _search(parts, options or SearchOptions(), proves, heard)
     for part in parts:
         if ended_by in ("work", "time") and not part.ended:
             part.stopped = ended_by
@@ -157,6 +159,7 @@ def _search(
     parts: Sequence[Search[Model]],
     options: SearchOptions,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None,
+    heard: Callable[[Search[Model]], None],
 ) -> str:
     """Search until an answer is accepted; return why the search ended."""
     budget, stage = _Budget(options), 0
@@ -170,6 +173,7 @@ def _search(
     while not all(part.ended for part in parts):
         while here := [part for part in parts if part.stage == stage and not part.ended]:
             for part in here:
+                heard(part)
                 part.advance(budget)
                 if spent := budget.spent:
                     return spent

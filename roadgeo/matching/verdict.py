@@ -216,11 +216,16 @@ def _refuse(
     """Describe why nothing is reported, for the reference that came nearest."""
     nearest = next((result for result in searched if listed and listed[0].index.is_of_map(result.index)), None)
     nearest = nearest or max(searched, key=lambda result: result.n_tried)
-    code, reason = _why_nothing(query, nearest, listed, options)
-    if listed:
-        runner_up = next((place for place in listed[1:] if _was_compared(place, searched)), None)
-        location = _at(location, listed, runner_up, options)
     names = list(dict.fromkeys(result.index.name for result in searched))  # shards bear the name of their map
+    where = "on this map" if len(names) == 1 else "on these maps"
+    code, reason = _why_nothing(query, nearest, listed, options, where)
+    if listed:
+        best, *others = listed
+        runner_up = next((place for place in others if _was_compared(place, searched)), None)
+        # The likeliest leads nothing, so what leads another map has no higher score.
+        capped = [place.but(score=min(place.score, best.score)) for place in others]
+        capped.sort(key=lambda place: -place.score)
+        location = _at(location, [best, *capped], runner_up, options)
     owed = dict.fromkeys(str(result.index.meta.get("attribution") or "") for result in searched)
     if len(names) > 1:
         n_ended = len(names) - len({result.index.name for result in searched if result.stopped != "exhausted"})
@@ -255,7 +260,7 @@ def _was_compared(place: Place, searched: Sequence[Searched]) -> bool:
 
 
 def _why_nothing(
-    query: Query, nearest: Searched, listed: Sequence[Place], options: LocateOptions
+    query: Query, nearest: Searched, listed: Sequence[Place], options: LocateOptions, where: str
 ) -> tuple[Reason, str]:
     """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
@@ -279,7 +284,7 @@ def _why_nothing(
         return Reason.TIME_LIMIT, sentence
     return (
         Reason.NOTHING_STANDS_OUT,
-        f"no place on this map stands out: {best}{within}; {_what_may_help(query, listed, options)}",
+        f"no place {where} stands out: {best}{within}; {_what_may_help(query, listed, options)}",
     )
 
 

@@ -9,6 +9,7 @@ import os
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -187,7 +188,7 @@ class Locating:
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
-        how = how or (explain if EXPLANATION.name in self.outputs.products else locate)
+        how = how or partial(explain if EXPLANATION.name in self.outputs.products else locate, say=self.say)
         options = self.search_options(task)
         paths, reading, sighting = output_paths(self.out_dir, task.stem), self.options.reading, None
         if self.options.taken is not None:

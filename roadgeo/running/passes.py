@@ -133,7 +133,7 @@ def _discount(location: Location, what: str, tried: int, options: LocateOptions)
     location = replace(location, places=places)
     if places[0].score >= options.min_log10_odds or location.place is None:
         return location if location.place is None else location.saying(f"{_in_ways(tried)}, here at {what}")
-    few = f"one place stands out, at {what}, but not clearly enough; {_in_ways(tried)}"
+    few = f"one place stands out, at {what}, but not clearly enough"
     return replace(location, status="not_located", reason=few, reason_code=Reason.TOO_MANY_LOOKS)
 
 

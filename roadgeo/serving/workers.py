@@ -223,7 +223,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
 
     def search(*arguments: Any) -> Any:
         say("searching the map")
-        return locate(*arguments)
+        return partial(locate, say=say)(*arguments)
 
     def tell(text: str, share: float | None = None) -> None:
         say(_without(request.path, text), share)

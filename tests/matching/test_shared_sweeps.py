@@ -228,3 +228,14 @@ def test_a_broken_mask_is_found_in_company_as_it_is_alone(towns):
     )
     assert [one.stopped == "accepted" for one in company] == [False, False, True, False]
     assert company[2].places[0].score > 0.9 * alone[0].places[0].score > 3.5
+
+
+def test_where_nothing_stands_out_each_map_says_when_its_turn_comes(towns):
+    graph = look(random_network(15, 2000.0), TRUTH, (600, 600), Sight(1.0, missing=0.3))
+    scene = scene_of(graph)
+    said, query = [], Query("elsewhere", scene, graph, Seconds())
+    parts = [
+        Whole(replace(index, meta={**index.meta, "name": name})) for index, name in zip(towns[1], "aabc", strict=True)
+    ]
+    search_references(query, parts, LocateOptions(effort="quick"), 60.0, say=lambda text, _=None: said.append(text))
+    assert said == [f"searching each map alone, map {k} of 3" for k in (1, 2, 3)]

@@ -60,7 +60,13 @@ def test_what_is_too_unlikely_for_a_second_pass_is_refused():
     assert location.status == "not_located"
     assert location.center is None
     assert location.log10_odds < OPTIONS.min_log10_odds
-    assert "not clearly enough" in location.reason
+    assert location.reason == "one place stands out, at pass 1, but not clearly enough"
+
+
+def test_a_refusal_counts_the_ways_once():
+    unsure = found(odds=OPTIONS.min_log10_odds + 0.2)
+    location, _ = take(found("not_located"), unsure, found("not_located"))
+    assert location.reason == "one place stands out, at pass 1, but not clearly enough; its roads were traced in 3 ways"
 
 
 def test_no_pass_is_taken_when_the_time_is_gone():

@@ -112,7 +112,7 @@ def phone(served, chromium):
 def hard(monkeypatch):
     """Masks that are called hard are refused without a hint, and those that are called twins lie at two places."""
 
-    def judge(mask, references, options):
+    def judge(mask, references, options, **_):
         found = locate(mask, references, options)
         if options.near is not None or options.match.within is not None:
             return found
@@ -256,7 +256,7 @@ def test_a_place_of_a_refusal_is_taken(page, served, monkeypatch):
     """Of a refusal that lists two places, the second is taken."""
     _, workers, mask, _ = served
 
-    def refuse(mask, references, options):
+    def refuse(mask, references, options, **_):
         found = locate(mask, references, options)
         places = (found.place, moved(found.place, 900.0, 0.0, score=-1.0))
         reason = "no place; the heading to 5 degrees (--heading DEG+-5) would help"

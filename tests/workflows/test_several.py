@@ -155,6 +155,14 @@ def test_a_refusal_tells_the_odds_of_the_best_and_of_the_next_place(query, searc
     assert best.runner_up.center.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
 
 
+def test_a_refusal_lists_the_places_of_all_maps_by_their_scores(query, searched):
+    """What leads another map, and explains less, has no higher score than the likeliest."""
+    first = searched("a", (0.2, 0.0), (-0.9, 5000.0), likelihood=30.0)
+    best = judge(query, first, searched("b", (0.7, 30_000.0), likelihood=9.0))
+    assert [(place.reference, place.score) for place in best.places] == [("a", 0.2), ("b", 0.2), ("a", -0.9)]
+    assert best.reason.startswith("no place on these maps stands out")
+
+
 def test_a_given_focal_length_is_used_for_the_tilt(query, town):
     """A homography alone tells the tilt to a degree at best, with the focal length it tells it to hundredths."""
     truth = camera((1000.0, 1000.0), SIZE, 1.0, tilt_deg=24.0, azimuth_deg=70.0, focal_px=900.0)
