@@ -73,6 +73,8 @@ def test_messages_of_the_program_name_what_qgis_has() -> None:
     text = "Give one source: --osm PLACE, or `roadgeo index --bbox`; `roadgeo simulate` and --gsd-like stay"
     shown = runner.in_words_of_qgis(text, labels)
     assert shown == "Give one source: “Place” PLACE, or “Build road reference”; `roadgeo simulate` and --gsd-like stay"
+    advice = runner.in_words_of_qgis("5 % (--gsd SIZE+-5%), 200 m (--near LON,LAT,200)", {**labels, "--near": "Near"})
+    assert advice == "5 % (“Pixel size” SIZE+-5%), 200 m (“Near”)"
     text = "this needs pymavlink, which is not installed: pip install 'roadgeo[mavlink]'"
     assert runner.in_words_of_qgis(text, {}).endswith("“Set up roadgeo” installs roadgeo[mavlink]")
 

@@ -115,7 +115,7 @@ def test_of_places_that_fit_alike_any_is_looked_at_and_chosen(seen: dict) -> Non
     assert seen["ambiguous"].startswith("drone: two places fit almost equally")
     assert seen["ambiguous_buttons"] == ["Choose the place...", "Mend by hand"]
     assert seen["button_within"]
-    assert seen["places"] == [["porto-streets", "0.0 km", "best"], ["porto-streets", "1.4 km", "6 times less"]]
+    assert seen["places"] == [["0.8", "porto-streets", "0.0 km"], ["-0.8", "porto-streets", "1.4 km"]]
     assert seen["looked_at"] == pytest.approx(-8.618, abs=5e-3)
     lon, lat = (float(text) for text in seen["chosen"]["NEAR"].split(" ")[0].split(","))
     assert (lon, lat) == (pytest.approx(-8.618, abs=1e-3), pytest.approx(41.1625, abs=1e-3))
@@ -138,6 +138,9 @@ def test_a_place_of_a_refused_picture_is_taken_and_the_result_says_so(seen: dict
     assert [float(taken["LONGITUDE"]), float(taken["LATITUDE"])] == pytest.approx(taken["place"], abs=1e-4)
     assert Path(taken["FOOTPRINT"]).exists()
     assert taken["message"].startswith("elsewhere: chosen by you: place 2 of ")
+    assert taken["alone"] == 1  # that of the refusal is gone
+    assert taken["shown"] == pytest.approx(taken["place"], abs=0.005)  # and the dialogs are closed
+    assert len(taken["open"]) == 1
 
 
 def test_the_panel_opens_with_the_points_of_what_was_located(seen: dict) -> None:

@@ -110,11 +110,11 @@ def main():
         assert not made.icon().isNull()
         assert made.helpUrl().endswith(f"help.html#{made.name()}")
         algorithms[made.name()] = {option.name: type(option.define()).__name__ for option in made.OPTIONS}
-    dock, match = loaded["dock"].MatchDock(), loaded["refit"].Match
+    dock, match = loaded["dock"].MatchDock(), loaded["refit"].TiePoint
     dock._renew([match(u, v, 2.0 * u, 3.0 * v) for u, v in ((0, 0), (100, 0), (100, 80), (0, 80), (40, 30))])
     dock.delete_chosen()
     dock.undo()
-    place = loaded["library"].Place(8.0, 47.0, 3.0, "town", [])
+    place = loaded["library"].ListedPlace(8.0, 47.0, 3.0, "town", [])
     loaded["places"].list_places = lambda _: [place]
     loaded["places"]._measure = lambda *_: 0.0
     location = {"reason": "two places fit", "footprint_lonlat": None}

@@ -73,6 +73,16 @@ def fill_and_run(dialog, name):
     return {"title": ended_title, **ended[0]}
 
 
+def await_end(dialog):
+    """Wait for an algorithm that runs in its dialog; return whether all went well, and the results."""
+    ended, loop = [], QEventLoop()
+    dialog.algorithmFinished.connect(lambda *done: (ended.extend(done), loop.quit()))
+    QTimer.singleShot(240_000, loop.quit)
+    loop.exec()
+    settle(1000)
+    return ended
+
+
 def message():
     """What the message bar says, and its buttons."""
     settle(1000)
@@ -170,6 +180,7 @@ def choose(messages, window):
     reason = "two places fit almost equally: the roads that the picture shows explain one of them only 6 times better; "
     reason += "a pixel size, a heading or a part of the map would decide between them"
     second = {"center": {**center, "lon": center["lon"] - 0.01, "lat": center["lat"] + 0.01}, "log10_odds": -0.8}
+    second["reference"] = location["reference"]
     location |= {"status": "ambiguous", "reason": reason, "log10_odds": 0.8, "alternatives": [second]}
     parameters = {"MASK": TASK["picture"], "REFERENCE": "porto-streets", "OUTPUT_FOLDER": "TEMPORARY_OUTPUT"}
     found = session.Finding("drone", TASK["picture"], "", "", location, parameters)
@@ -187,12 +198,12 @@ def choose(messages, window):
     extent = iface.mapCanvas().extent()
     ANSWER["looked_at"] = extent.center().x()
     keep(dialog, "alike")
-    ANSWER["places"] = [[dialog.list.topLevelItem(row).text(k) for k in (1, 2, 3)] for row in range(len(dialog.places))]
+    ANSWER["places"] = [[dialog.list.topLevelItem(row).text(k) for k in (0, 1, 3)] for row in range(len(dialog.places))]
     dialog.button.click()
     again = window.OPEN[-1]
     values = again.createProcessingParameters()
     ANSWER["chosen"] = {name: str(values.get(name)) for name in ("NEAR", "NEAR_RADIUS", "MASK")}
-    again.close()
+    await_end(again)
     # Not sure there either: the panel opens with the corners of the best place.
     messages.announce("locatemask", replace(found, parameters={**parameters, **ANSWER["chosen"]}))
     ANSWER["again"], buttons = message()
@@ -222,17 +233,13 @@ def take(window):
     keep(dialog, "places")
     second = dialog.places[1]
     dialog.take()
-    running, loop, ended = window.OPEN[-1], QEventLoop(), []
-    running.algorithmFinished.connect(lambda *done: (ended.extend(done), loop.quit()))
-    QTimer.singleShot(240_000, loop.quit)
-    loop.exec()
-    results = {key: str(value) for key, value in ended[1].items()}
+    results = {key: str(value) for key, value in await_end(window.OPEN[-1])[1].items()}
     ANSWER["taken"] = {"place": [second.lon, second.lat], "listed": len(dialog.places), **results}
-    keep(running, "taken_log")
-    running.close()
-    ANSWER["taken"]["message"], buttons = message()
-    buttons["Zoom to it"].click()
-    settle()
+    ANSWER["taken"]["message"], _ = message()
+    ANSWER["taken"]["alone"] = [one.title() for one in iface.messageBar().items()].count("elsewhere")
+    middle = iface.mapCanvas().extent().center()
+    ANSWER["taken"]["shown"] = [middle.x(), middle.y()]
+    ANSWER["taken"]["open"] = [one.windowTitle() for one in QgsApplication.topLevelWidgets() if one.isVisible()]
     iface.mapCanvas().waitWhileRendering()
     keep(iface.mainWindow(), "taken")
 

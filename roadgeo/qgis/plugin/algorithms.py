@@ -117,7 +117,9 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def processAlgorithm(self, parameters: dict[str, Any], context: Any, feedback: Any) -> dict[str, Any]:
         """Run."""
-        self.session = Session(context, feedback, {option.flag: option.label for option in self.OPTIONS})
+        # Of parameters that write the same option the first lends its label.
+        labels = {option.flag: option.label for option in reversed(self.OPTIONS)}
+        self.session = Session(context, feedback, labels)
         return self.work(Values(self, parameters, context, feedback), self.session)
 
     def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:  # noqa: ARG002 (QGIS's signature)
@@ -294,7 +296,7 @@ def _locate(mask: str, picture: str, options: list[str], values: Values, session
     points_there, page_there = (str(path) if path.exists() else "" for path in (points, page))
     session.finding = Finding(name, picture, points_there, page_there, location, values.parameters)
     if location["status"] not in ("located", "chosen"):
-        for name_of_map in {place.map for place in list_places(location)} - {""}:
+        for name_of_map in dict.fromkeys(place.map for place in list_places(location)):
             session.show_map(name_of_map)
         session.feedback.pushWarning(f"{name}: {location['reason']}")
         return results

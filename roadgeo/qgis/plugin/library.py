@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qgis.core import QgsCoordinateReferenceSystem, QgsCoordinateTransform, QgsPointXY, QgsProject, QgsVectorLayer
-
 from .runner import run
 from .settings import locate_command, remembered_references
 
@@ -47,17 +45,17 @@ class ListedPlace:
     ----------
     lon, lat : float
         Its middle.
-    less : float
-        Decimal logarithm of how many times less likely it is than the best, at least; 0 for the best.
+    score : float
+        Its lead over all other places, powers of ten; below 0 where another fits better.
     map : str
-        Name of the reference that holds it, "" if unknown.
+        Name of the reference that holds it.
     footprint : list of [float, float]
         Corners, longitude and latitude; empty where only the middle is known.
     """
 
     lon: float
     lat: float
-    less: float
+    score: float
     map: str
     footprint: list[list[float]]
 
@@ -95,26 +93,17 @@ def find_reference(value: str) -> ListedReference:
 
 def list_places(location: dict[str, Any]) -> list[ListedPlace]:
     """List the places at which a picture may lie, the best first, with the maps that hold them."""
-    lead = location["log10_odds"] or 0.0
-    best = [{**location, "log10_odds": 0.0}] if location["center"] else []
-    maps = sorted(list_references(), key=lambda reference: reference.name != location["reference"])
-    boxes = [(reference.name, _box(reference.file)) for reference in maps if reference.file]
-    places: list[ListedPlace] = []
-    for listed in [*best, *location["alternatives"]]:
-        lon, lat, odds = listed["center"]["lon"], listed["center"]["lat"], listed["log10_odds"] or 0.0
-        on = (name for name, box in boxes if box.contains(QgsPointXY(lon, lat)))
-        # On its own map a place has odds against the best; where it is itself the best there, the lead is the least.
-        less = -odds if odds < 0.0 else max(lead, 0.0)
-        footprint = listed.get("footprint_lonlat") or []
-        places.append(ListedPlace(lon, lat, less if places else 0.0, next(on, ""), footprint))
-    return places
-
-
-def _box(file: str) -> Any:
-    """Return the extent of a map in degrees."""
-    roads = QgsVectorLayer(f"{file}|layername=roads", "roads", "ogr")
-    to = QgsCoordinateTransform(roads.crs(), QgsCoordinateReferenceSystem(LONLAT), QgsProject.instance())
-    return to.transformBoundingBox(roads.extent())
+    best = [location] if location["center"] else []
+    return [
+        ListedPlace(
+            listed["center"]["lon"],
+            listed["center"]["lat"],
+            listed["log10_odds"] or 0.0,
+            listed["reference"],
+            listed.get("footprint_lonlat") or [],
+        )
+        for listed in [*best, *location["alternatives"]]
+    ]
 
 
 def parse(line: str) -> dict[str, Any] | None:

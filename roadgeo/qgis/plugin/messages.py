@@ -53,7 +53,13 @@ def announce(algorithm: str, finding: Finding) -> None:
     level, lasts_s = (Qgis.MessageLevel.Success, 20) if located else (Qgis.MessageLevel.Warning, 0)
     if chosen:
         level = Qgis.MessageLevel.Info
-    QTimer.singleShot(_AFTER_MS, lambda: push(finding.name, text, offered, level, lasts_s))
+
+    def tell() -> None:
+        if located or chosen:
+            zoom(location["footprint_lonlat"])  # in the project's CRS, which its first layer may have set
+        push(finding.name, text, offered, level, lasts_s)
+
+    QTimer.singleShot(_AFTER_MS, tell)
 
 
 def _menu() -> Any:

@@ -171,6 +171,14 @@ def _write_near(values: Values, name: str) -> list[str]:
     return [f"--near={point.x():.9g},{point.y():.9g},{values.get('Double', 'NEAR_RADIUS'):.9g}"]
 
 
+def _write_stated(values: Values, name: str) -> list[str]:
+    if not values.get("Boolean", name):
+        return []
+    if values.given("NEAR"):
+        raise QgsProcessingException("Give a place, or tick that the camera says it, not both")
+    return ["--near=exif"]
+
+
 def _write_box(values: Values, name: str) -> list[str]:
     box = values.in_degrees("Extent", name)
     return [f"--bbox={box.xMinimum():.9g},{box.yMinimum():.9g},{box.xMaximum():.9g},{box.yMaximum():.9g}"]
@@ -281,8 +289,7 @@ _HINTS = _fold(
     Option(
         QgsProcessingParameterBoolean, "NEAR_STATED", "Near where its camera says",
         "In EXIF and XMP, with the errors of such statements. Pixel size and heading may be exif, too.",
-        "--near", {"defaultValue": False},
-        lambda values, name: ["--near=exif"] if values.get("Boolean", name) else [],
+        "--near", {"defaultValue": False}, _write_stated,
     ),
     *(_option("locate", flag) for flag, row in _LOCATE.items() if row["is_hint"] and flag != "--near"),
 )  # fmt: skip

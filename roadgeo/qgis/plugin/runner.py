@@ -144,7 +144,11 @@ def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
     )
     text = re.sub(r" ?Try 'roadgeo [^']*'\.?", "", text)
     text = re.sub(r"pip install '(roadgeo\[\w+\])'", r"“Set up roadgeo” installs \1", text)
-    return re.sub(r"--[a-z][a-z-]*", lambda match: f"“{labels[match[0]]}”" if match[0] in labels else match[0], text)
+    return re.sub(
+        r"(--[a-z][a-z-]*)( LON,LAT,\d+)?",  # a place is clicked on the map
+        lambda match: f"“{labels[match[1]]}”" if match[1] in labels else match[0],
+        text,
+    )
 
 
 def child_environment(environ: Mapping[str, str]) -> dict[str, str]:

@@ -145,6 +145,8 @@ class Session:
     def _hear(self, stream: str, line: str) -> None:
         """Take one line: results and progress are JSON objects, all else is for people."""
         document, line = parse(line), in_words_of_qgis(line, self.labels)
+        if document is not None and "reason" in document:
+            document["reason"] = in_words_of_qgis(document["reason"], self.labels)
         if document is not None and "progress" in document:
             progress = document["progress"]
             self.feedback.setProgress(100.0 * progress["done"] / progress["total"])

@@ -8,15 +8,17 @@ from typing import Any
 import processing
 from qgis.core import QgsCoordinateReferenceSystem, QgsCoordinateTransform, QgsPointXY, QgsProject, QgsRectangle
 from qgis.PyQt import sip
+from qgis.PyQt.QtCore import QTimer
 from qgis.PyQt.QtWidgets import QPushButton
 from qgis.utils import iface
 
 from .library import LONLAT
 
-__all__ = ["OPEN", "keep", "open_dialog", "push", "show_points", "to_map", "zoom"]
+__all__ = ["OPEN", "keep", "open_dialog", "push", "run_dialog", "show_points", "to_map", "zoom"]
 
-#: Dialogs that are open, which Python would let go of.
+#: Dialogs that are open, which Python would let go of; and the message under each title.
 OPEN: list[Any] = []
+_SAID: dict[str, Any] = {}
 
 
 def open_dialog(algorithm: str, parameters: dict[str, Any]) -> Any:
@@ -26,6 +28,13 @@ def open_dialog(algorithm: str, parameters: dict[str, Any]) -> Any:
     return dialog
 
 
+def run_dialog(algorithm: str, parameters: dict[str, Any]) -> None:
+    """Run an algorithm in its dialog, which closes where all went well: the result is on the map."""
+    dialog = open_dialog(algorithm, parameters)
+    dialog.algorithmFinished.connect(lambda well, _: QTimer.singleShot(0, dialog.close) if well else None)
+    dialog.runButton().click()
+
+
 def keep(dialog: Any) -> None:
     """Show a dialog, and keep it for as long as it is open."""
     dialog.show()
@@ -33,14 +42,21 @@ def keep(dialog: Any) -> None:
 
 
 def push(title: str, text: str, offered: dict[str, Any], level: Any, lasts_s: int = 0) -> Any:
-    """Put a message with buttons into the window's message bar, and return it; 0 seconds: until it is closed."""
+    """Put a message with buttons into the window's message bar, and return it; 0 seconds: until it is closed.
+
+    It takes the place of the message that had this title.
+    """
+    before = _SAID.get(title)
+    if before is not None and not sip.isdeleted(before):
+        iface.messageBar().popWidget(before)
     message = iface.messageBar().createMessage(title, text)
     message.setToolTip(text)
     for label, does in offered.items():
         button = QPushButton(label)
         button.clicked.connect(lambda _=False, does=does: does())
         message.layout().addWidget(button)
-    return iface.messageBar().pushWidget(message, level, lasts_s)
+    _SAID[title] = iface.messageBar().pushWidget(message, level, lasts_s)
+    return _SAID[title]
 
 
 def zoom(lonlat: Iterable[Iterable[float]], scale: float = 1.3) -> None:
