@@ -42,35 +42,3 @@ def test_all_of_it_loads_and_its_widgets_open(python: str, plugin: Path) -> None
     assert len(answer["algorithms"]) == 8
     assert answer["status"].startswith("Open a picture")
     assert answer["rows"] == 1
-
-
-#: A program that adds a row to the table of hints, installs the plugin, and lists what the other faces make of it.
-ANOTHER_ROW = """
-import json, sys
-from pathlib import Path
-from roadgeo.matching.hints import HINTS, Hint
-schema = {"type": "number", "minimum": 0, "maximum": 1}
-HINTS["cloud"] = Hint("cloud", "cloud_share", "SHARE", "Clouds", "How much they hide.", float, schema, 0.1)
-import roadgeo
-from roadgeo.cli.locate import locate_command
-from roadgeo.qgis.installation import install_plugin
-from roadgeo.serving.requests import read_query_string
-options = {name: one.help for one in locate_command.params for name in one.opts}
-print(json.dumps([options.get("--cloud"), read_query_string("cloud=0.5"), str(install_plugin(Path(sys.argv[1])))]))
-"""
-
-
-def test_a_new_row_of_the_table_is_an_option_everywhere(python: str, tmp_path: Path) -> None:
-    """On the command line, over HTTP and in QGIS by itself; `test_options` asks for the keyword of Python."""
-    command = [sys.executable, "-c", ANOTHER_ROW, str(tmp_path)]
-    made = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert made.returncode == 0, made.stderr
-    typed, read, plugin = json.loads(made.stdout)
-    assert typed == "How much they hide. Default: 0.1."
-    assert read == {"cloud_share": 0.5}
-    done = run(python, Path(plugin))
-    assert done.returncode == 0, done.stderr
-    algorithms = json.loads(done.stdout)["algorithms"]
-    for name in ("locatemask", "locatemasks", "georeferenceimage"):
-        assert algorithms[name]["CLOUD"] == "QgsProcessingParameterNumber"
-        assert algorithms[name]["EFFORT"] == "QgsProcessingParameterEnum"

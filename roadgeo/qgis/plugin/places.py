@@ -69,8 +69,9 @@ class PlacesDialog(QDialog):
         for widget in (advice, self.list, buttons):
             column.addWidget(widget)
         self.resize(680, 320)
-        corner = iface.mainWindow().geometry().bottomLeft()
-        self.move(corner.x(), corner.y() - 360)  # beside the middle of the map, to which places are brought
+        if self.parentWidget() is not None:
+            corner = self.parentWidget().geometry().bottomLeft()
+            self.move(corner.x(), corner.y() - 360)  # beside the middle of the map, to which places are brought
         self.finished.connect(self._clear)
         self.list.setCurrentItem(self.list.topLevelItem(0))
 
