@@ -50,7 +50,17 @@ def decide(query: Query, searched: Sequence[Searched], options: LocateOptions) -
 
 
 def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
-    """Compare the places with each other and with the thresholds; describe the best, or the reason for a refusal."""
+    """Decide: the first case that holds is the answer. S is the score needed; scores are leads (see `rivals.Rivals`).
+
+    ===========================================================  ===========================
+    the roads fit better where the hints exclude (`veto`)        not located, fits_elsewhere
+    no score of S, but two places agree in whole, or lead all    ambiguous, two_places
+    no score of S                                                not located (`_why_nothing`)
+    a place that leads another map by S lowers the score below   ambiguous, two_places
+    the middle is uncertain along a road                         ambiguous, half_a_place
+    otherwise                                                    located
+    ===========================================================  ===========================
+    """
     location = _describe_work(query, searched)
     if options.method == "pair":
         return _decide_pairs(location, query, searched, options)
