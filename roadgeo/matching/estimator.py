@@ -303,8 +303,11 @@ class TripleEstimator:
             elsewhere = self.allow(proposals) & ~is_own & (proposals.placed >= placed)
             kept = self.screen(proposals, elsewhere, MAX_SCREENED)
             for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
-                if not other.same(place):
-                    self.verified.append(self.refine_whole(self.settle(other)[0]))
+                if other.same(place):
+                    continue
+                whole = self.refine_whole(self.settle(other)[0])
+                if whole.refined is not None and self.may_be(whole.matrix):
+                    self.verified.append(whole)
 
     def settle(self, place: Place) -> tuple[Place, float]:
         """Return a place refined, and its score: its lead over the places that were met, and over those nearby."""

@@ -22,7 +22,7 @@ from roadgeo.running.options import ReadOptions
 from roadgeo.running.passes import Locate, PassRoads, Sighting, locate_passes
 from roadgeo.running.photographs import Pass, call_segmenter, locate_photograph, open_segmented, plugin_of
 from roadgeo.running.pictures import as_file
-from roadgeo.running.variants import undoing
+from roadgeo.running.variants import Judge, undoing
 from roadgeo.sources.drawn_roads import draw_roads
 from roadgeo.sources.georeference import read_pixel_shape, read_stated_middle
 from roadgeo.sources.masks import MaskSource, is_photograph, open_mask
@@ -45,9 +45,15 @@ def locate_query(
     reading: ReadOptions | None = None,
     *,
     how: Locate = locate,
+    judge: Judge | None = None,
     say: Say = say_nothing,
 ) -> Sighting:
     """Locate a mask or a photograph; an array, (H, W) or (H, W, bands), is a mask.
+
+    Parameters
+    ----------
+    how, judge : callable
+        See `undoing`.
 
     Raises
     ------
@@ -60,7 +66,7 @@ def locate_query(
     """
     options, reading = options or LocateOptions(), reading or ReadOptions()
     with open_query(path, reading) as query:
-        how = undoing(how, query.aspect, query.mirrored)
+        how = undoing(how, query.aspect, query.mirrored, judge)
         sighting = _locate(query, references, options, reading, how, say)
     if query.mirrored and reading.mirror is None:
         location = sighting.location.saying("the georeference of the file mirrors it, which was undone")

@@ -8,7 +8,7 @@ is given in pixels of the mask.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -24,7 +24,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference
 from roadgeo.running.passes import Locate
 
-__all__ = ["Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "trimmed", "undoing"]
+__all__ = ["Judge", "Variant", "in_pixels_of", "mirrored", "resampled", "stretched", "trimmed", "undoing"]
 
 _MIN_SIDE = 32  # pixels, of a part that is located by itself
 
@@ -96,11 +96,17 @@ def in_pixels_of(location: Location, size: tuple[int, int], matrix: FloatArray) 
     return replace(location, places=places, content=content)
 
 
-def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
+#: What places a variant of a mask of (H, W).
+Judge = Callable[[Variant, tuple[int, int]], Location]
+
+
+def undoing(how: Locate, aspect: float | None, mirror: bool, judge: Judge | None = None) -> Locate:
     """Return what locates a mask as `how` does: without margins, with square pixels, and mirrored back.
 
     Parameters
     ----------
+    how : callable
+        Unless there is a `judge`, which knows how the variant lies in the mask.
     aspect : float or None
         How many times a pixel is as wide as high; None: once.
     mirror : bool
@@ -108,15 +114,18 @@ def undoing(how: Locate, aspect: float | None, mirror: bool) -> Locate:
     """
 
     def locate(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location | Explanation:
+        def place(variant: Variant) -> Location | Explanation:
+            return how(variant.mask, references, options) if judge is None else judge(variant, mask.shape)
+
         variant = undone(trimmed(mask))
-        answer = how(variant.mask, references, options)
+        answer = place(variant)
         if trimmed(mask).mask is not mask and any(one.lens_k1 for one in _location_of(answer).places):
             variant = undone(Variant(mask, np.eye(3)))  # a lens bends around the middle of the whole frame
-            answer = how(variant.mask, references, options)
+            answer = place(variant)
         if variant.mask is mask:
             return answer
-        place = _stating_pixels(in_pixels_of(_location_of(answer), mask.shape[::-1], variant.matrix), aspect)
-        return replace(answer, location=place) if isinstance(answer, Explanation) else place
+        located = _stating_pixels(in_pixels_of(_location_of(answer), mask.shape[::-1], variant.matrix), aspect)
+        return replace(answer, location=located) if isinstance(answer, Explanation) else located
 
     def undone(variant: Variant) -> Variant:
         square = variant if aspect in (None, 1.0) else stretched(variant, aspect)

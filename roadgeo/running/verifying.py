@@ -17,7 +17,7 @@ from roadgeo.geometry.displacement import Displacement
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 from roadgeo.geometry.transformation import exactness
 from roadgeo.location import Location, Spent
@@ -28,6 +28,7 @@ from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.queries import locate_query
 from roadgeo.running.tasks import Task
+from roadgeo.running.variants import Variant
 from roadgeo.sources.georeference import read_georeference
 
 if TYPE_CHECKING:
@@ -150,14 +151,15 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     results: list[Checked] = []
     aspect, is_mirrored = image.place.pixel_shape()
 
-    def check(mask: RoadMask, _: Sequence[AnyReference], __: LocateOptions) -> Location:
-        query = read_query(mask)
-        there = start @ _to_image(mask.shape, image.place.size, is_mirrored) @ PIXEL_TO_PLANE
+    def check(variant: Variant, shape: tuple[int, int]) -> Location:
+        coarser = np.diag([image.place.size[0] / shape[1], image.place.size[1] / shape[0], 1.0])
+        there = start @ coarser @ np.linalg.inv(variant.matrix) @ PIXEL_TO_PLANE
+        query = read_query(variant.mask)
         checked = check_place(there, query, reference.index, image.settings.options)
         results.append(checked)
         is_decided = checked.verdict != "unknown"
         return Location(
-            mask.name, "located" if is_decided else "not_located", checked.reason, spent=Spent(query.seconds)
+            variant.mask.name, "located" if is_decided else "not_located", checked.reason, spent=Spent(query.seconds)
         )
 
     gsd = math.sqrt(abs(np.linalg.det(Homography(start).jacobian(Frame(*image.place.size).center))))
@@ -165,17 +167,10 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
     search = replace(options.search, time_limit_s=60.0)
     reading = replace(image.settings.reading, mirror=is_mirrored, aspect=aspect or 1.0)
-    locate_query(image.name, [reference], replace(options, match=match, search=search), reading, how=check)
+    locate_query(image.name, [reference], replace(options, match=match, search=search), reading, judge=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")
     return next((checked for checked in results if checked.verdict != "unknown"), results[0])
-
-
-def _to_image(shape: tuple[int, int], size: tuple[int, int], is_mirrored: bool) -> FloatArray:
-    """Return the map (3, 3) from pixels of a mask of (H, W), which may be coarser and mirrored, to an image's."""
-    coarser = np.diag([size[0] / shape[1], size[1] / shape[0], 1.0])
-    over = np.array([[-1.0, 0.0, shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(coarser @ over) if is_mirrored else coarser
 
 
 # --- telling ----------------------------------------------------------------------------------------------------------

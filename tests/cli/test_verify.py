@@ -13,6 +13,7 @@ from worlds.demo import MASKS
 from worlds.rasters import write_raster
 from worlds.turned import mark_turned
 
+import roadgeo
 from roadgeo.cli import main
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
@@ -61,6 +62,22 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     with rasterio.open("out/wrong_fixed.tif") as fixed, rasterio.open("wrong.tif") as given:
         assert (fixed.read() == given.read()).all()
         assert fixed.crs == given.crs
+
+
+@pytest.mark.parametrize("margins", [(0, 0, 0, 0), (90, 0, 160, 0), (0, 120, 0, 70), (50, 60, 70, 80)])
+@pytest.mark.parametrize("over", [1, -1])
+def test_margins_that_were_not_observed_move_nothing(margins: tuple[int, ...], over: int, porto: Path) -> None:
+    with rasterio.open(georeferenced("plain.tif", 40, 10)) as source:
+        values, transform, crs = source.read(1), source.transform, source.crs
+    top, bottom, left, right = margins
+    padded = np.pad(np.where(values > 127, 255, 1).astype(np.uint8), ((top, bottom), (left, right)))  # 0: nodata
+    transform = transform @ rasterio.Affine.translation(-left, -top)
+    if over < 0:  # stored from right to left
+        transform = transform @ rasterio.Affine(-1, 0, padded.shape[1], 0, 1, 0)
+    name = write_raster("padded.tif", padded[:, ::over], crs=crs, transform=transform, nodata=0)
+    checked = roadgeo.verify(name, porto).document
+    assert checked["verdict"] == "off"
+    assert np.hypot(checked["displacement"]["east_m"] + 40, checked["displacement"]["north_m"] + 10) < 0.5
 
 
 def test_an_image_is_overwritten_only_where_that_is_asked_for(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

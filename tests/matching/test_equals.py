@@ -51,6 +51,17 @@ def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
     assert estimator.n_verified == n_verified
 
 
+def test_an_equal_place_that_the_hints_exclude_is_no_rival(twice):
+    query, index, there = twice
+    center = Homography(TRUTH).everywhere(query.scene.center)
+    reach_m = np.hypot(*(there - center)) - 200.0  # its first guess may lie within a frame of the circle
+    estimator = TripleEstimator(query.scene, index, near=(*center, reach_m))
+    place, _ = estimator.settle(Place(query.scene, index, TRUTH))
+    estimator.look_for_equals(place)
+    assert estimator.n_hypotheses > 0
+    assert all(np.hypot(*(other.center - center)) < reach_m for other in estimator.verified)
+
+
 def test_places_that_are_equal_but_for_turn_and_scale_are_ambiguous(twice):
     query, index, _ = twice
     options = LocateOptions()

@@ -227,7 +227,7 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
         raise MaskError(f"{name}: holds no observed pixel; give a photograph that shows ground")
     if palette is not None:
         exact = palette[exact[..., 0]]
-    rows, columns = _within_margins(np.where(valid[..., None], exact, exact[valid][0]))
+    rows, columns = _within_margins(exact, valid)
     box = _Box(columns.start * scale, rows.start * scale, columns.stop * scale, rows.stop * scale)
     _report_margins(name, box, (width, height))
     exact, sample, valid = (values[rows, columns] for values in (exact, sample, valid))
@@ -243,25 +243,28 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
     return _Tones(None, None if keeps else (low, high), plain), box
 
 
-def _within_margins(values: AnyArray) -> tuple[slice, slice]:
+def _within_margins(values: AnyArray, valid: BoolArray) -> tuple[slice, slice]:
     """Return the rows and columns of (H, W, B) values without the plain lines around them; all where little is left."""
     height, width = values.shape[:2]
     middle = values[height // 4 : height - height // 4, width // 4 : width - width // 4]
     grain = _GRAIN * np.ptp(np.percentile(middle, [1, 99]))
-    box = everything = slice(0, height), slice(0, width)
-    while (inner := _less_margin(values, box, grain)) != box:
+    y, x = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+    box = declared = slice(int(y[0]), int(y[-1]) + 1), slice(int(x[0]), int(x[-1]) + 1)
+    while (inner := _less_margin(values, valid, box, grain)) != box:
         box = inner
-    return box if values[box].size >= _SHOWN_SHARE * values.size else everything
+    shows_much = values[box].size >= _SHOWN_SHARE * values.size
+    return box if shows_much and box != declared else (slice(0, height), slice(0, width))
 
 
-def _less_margin(values: AnyArray, box: tuple[slice, slice], grain: float) -> tuple[slice, slice]:
-    """Return a part of (H, W, B) values without the lines at its edges that are of one value each."""
-    part = values[box].astype(np.float32)
+def _less_margin(values: AnyArray, valid: BoolArray, box: tuple[slice, slice], grain: float) -> tuple[slice, slice]:
+    """Return a part of (H, W, B) values without the lines at its edges that are of one value each, where observed."""
+    part, shown = values[box].astype(np.float32), valid[box]
     inner = []
     for axis, side in enumerate(box):
-        lines = part if axis == 0 else part.swapaxes(0, 1)
+        lines, observed = (part, shown) if axis == 0 else (part.swapaxes(0, 1), shown.T)
         off = np.abs(lines - np.median(lines, axis=1, keepdims=True)).max(axis=2)
-        uneven = np.flatnonzero((off <= grain).mean(axis=1) < _PLAIN_SHARE)
+        n_plain, n_observed = ((off <= grain) & observed).sum(axis=1), observed.sum(axis=1)
+        uneven = np.flatnonzero((n_plain < _PLAIN_SHARE * n_observed) | (n_observed < 0.5 * lines.shape[1]))
         first, last = (uneven[0], uneven[-1]) if len(uneven) else (0, len(lines) - 1)
         before, after = (n + _MARGIN_EDGE_PX if n else 0 for n in (int(first), len(lines) - 1 - int(last)))
         inner.append(slice(side.start + before, max(side.stop - after, side.start + before + 1)))

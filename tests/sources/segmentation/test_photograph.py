@@ -136,3 +136,23 @@ def test_a_plain_sea_does_not_hide_the_picture(tmp_path: Path) -> None:
     values = np.full((300, 400), 90, np.uint8)
     values[140:160, 190:210] = np.random.default_rng(0).integers(0, 255, (20, 20))
     assert grounds(write_raster(tmp_path / "a.tif", values)).all()
+
+
+@pytest.mark.parametrize("how", ["alpha", "nodata"])
+def test_the_tips_of_a_turned_picture_are_no_margins(
+    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Lines at the edge of its frame show little of it; what the file declares is nodata is no plain margin."""
+    values = np.clip(framed(90)[INSIDE], 1, 255)
+    y, x = np.indices(values.shape)
+    shown = abs(x - 200) / 200 + abs(y - 150) / 150 < 1
+    values = np.where(shown, values, 0).astype(np.uint8)
+    if how == "alpha":
+        bands = np.stack([values, values, values, np.where(shown, 255, 0).astype(np.uint8)])
+        path = write_raster(tmp_path / "a.tif", bands, photometric="RGB", alpha="yes")
+    else:
+        path = write_raster(tmp_path / "a.tif", values, nodata=0)
+    ground = grounds(path)
+    assert not ground[~shown].any()
+    assert [np.ptp(np.flatnonzero(ground.any(axis=axis))) for axis in (1, 0)] == pytest.approx(SHAPE, abs=8)
+    assert "margins" not in caplog.text
