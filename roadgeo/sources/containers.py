@@ -7,6 +7,7 @@ The file's name determines its format: OpenStreetMap data through osmium, answer
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,8 +19,9 @@ from roadgeo._arrays import AnyArray
 from roadgeo.errors import NoRoadsError, RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through, objects
 from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_ways
-from roadgeo.sources.schemas import is_known_column, names_kinds
+from roadgeo.sources.schemas import is_filled, is_known_column, names_kinds
 from roadgeo.storage.memory import each_bounded
+from roadgeo.storage.unpacking import read_chunks
 from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
 
 __all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_missing"]
@@ -51,6 +53,8 @@ _LIMITED = re.compile(
 #: Formats of a feature a line; and the name of an XML file's outermost element, behind what may come before it.
 _BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
 _ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*+(?:<[?!].*?>\s*+)*+<([\w:.-]+)"), 1 << 12
+#: What servers and checkouts put in a file's place.
+_IN_PLACE = re.compile(rb"(?i)\s*(?:(<!doctype html|<html\b)|version https://git-lfs)")
 _ENDS_BYTES = 1 << 16  # of a file, where such a note stands
 _TILES = "vector tiles, which cut roads at their borders and simplify them; give the data that they were made of"
 #: Formats that are not read, and the way out for their users.
@@ -107,7 +111,7 @@ def _stream(
     areas: bool,
 ) -> Iterator[RoadTable]:
     name = path.name.lower()
-    if why := _ELSEWHERE.get(path.suffix.lower()):
+    if why := _ELSEWHERE.get(path.suffix.lower()) or _what_is_wrong(path):
         raise RoadSourceError(f"{path}: {why}")
     if name.endswith(OSM_ENDINGS):
         yield from stream_ways(path, most, advance, folder)
@@ -137,7 +141,6 @@ def _stream_gdal(
 ) -> Iterator[RoadTable]:
     import shapely
 
-    _require_whole(path)
     parts = _choose_parts(path, [layer] if isinstance(layer, str) else [*(layer or ())], areas=areas)
     for n, (held, column, levels) in enumerate(parts):
         total, columns, hint = _choose_columns(path, held)
@@ -145,8 +148,14 @@ def _stream_gdal(
         for skip in range(0, max(total, 1), most):
             more = [column] * (column not in ("", *columns))
             data = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
-            if data.shapes is None:
-                raise NoRoadsError(f"{path}: layer {held!r} has no geometry, expected lines")
+            meta = {
+                "format": data.driver,
+                "layer": ", ".join(levels or [one.layer for one in parts]),
+                **data.notes,
+            }
+            if data.shapes is None or data.driver == "CSV":  # GDAL knows one name of a column of shapes
+                yield _undeclared(path, held, skip, most if total > most else None, meta)
+                continue
             if len(data.shapes) < min(most, total - skip):
                 raise RoadSourceError(
                     f"{path}: is cut off: {skip + len(data.shapes):,} of {total:,} features are in it"
@@ -156,14 +165,27 @@ def _stream_gdal(
                 named = table[column.lower()] if column in columns else table.pop(column.lower())
                 rows = np.isin(named.astype(str), levels)
                 shapes, table = shapes[rows], {name: values[rows] for name, values in table.items()}
-            meta = {
-                "format": data.driver,
-                "layer": ", ".join(levels or [one.layer for one in parts]),
-                **data.notes,
-            }
             meta |= ({"part": part} if part else {}) | ({"levels": hint} if hint and not levels else {})
             yield RoadTable(shapes, data.crs, table, meta)
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(parts))
+
+
+def _undeclared(path: Path, layer: str, skip: int, most: int | None, meta: dict[str, Any]) -> RoadTable:
+    """Read a part of a layer without geometry, one of whose columns holds shapes."""
+    data = read_layer(path, layer, describe_layer(path, layer)[1], skip, most)
+    columns = dict(data.columns)
+    taken = _take_shapes(columns)
+    if taken is None:
+        raise NoRoadsError(f"{path}: layer {layer!r} has no geometry, nor a column of WKT or WKB; expected lines")
+    if data.driver == "CSV" and len(taken[0]) and taken[0][-1] is None and not _ends_in_a_line(path):
+        raise RoadSourceError(f"{path}: is cut off in its last line; copy or export it again")
+    return RoadTable(taken[0], data.crs or taken[1] or None, columns, meta)
+
+
+def _ends_in_a_line(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read() in b"\r\n"
 
 
 def _choose_parts(path: Path, asked: Sequence[str], *, areas: bool) -> list[_Part]:
@@ -245,23 +267,28 @@ def _listed(names: Sequence[str]) -> str:
     return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
 
 
-def _require_whole(path: Path) -> None:
-    """Refuse a file that ends too early, of a format of which GDAL would read the rest."""
+def _what_is_wrong(path: Path) -> str:
+    """Return why a file is none: nothing, or another thing, came in its place, or it ends too early; "" of others."""
     if not path.is_file():
-        return
+        return ""
     ending, size = path.suffix.lower(), path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
         file.seek(max(size - _HEAD_BYTES, 0))
         last = file.read().rstrip()
+    has_open_text = ending == ".csv" and sum(chunk.count(b'"') for chunk in read_chunks(path)) % 2 > 0
+    if not head.strip():
+        return "is empty; copy or export it again"
+    if came := _IN_PLACE.match(head):
+        return "is a web page; fetch the file itself" if came[1] else "is a pointer of Git LFS; fetch it (git lfs pull)"
     root = _ROOT.match(head) if ending in (".gml", ".gpx", ".kml") else None
     is_cut = (
-        (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
+        has_open_text
+        or (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
         or (ending in _BY_LINES and not last.endswith(b"}"))
         or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
     )
-    if is_cut:
-        raise RoadSourceError(f"{path}: is cut off after {size:,} bytes; copy or export it again")
+    return f"is cut off after {size:,} bytes; copy or export it again" if is_cut else ""
 
 
 def what_is_missing(path: Path, n_features: int) -> str:
@@ -444,20 +471,24 @@ def _held_columns(roads: Any) -> RoadTable:
     if name is not None:
         shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
         return RoadTable(shapes, getattr(roads, "crs", None), columns)
-    name = next((name for name, values in columns.items() if _is_shape(_first(values))), None)
-    if name is None:
-        raise _unreadable(roads, "none of its columns holds shapes")
-    values = [None if value is None or value != value else value for value in columns.pop(name)]
     try:
-        shapes, srid = _read_shapes(values)
+        taken = _take_shapes(columns)
     except TypeError as error:
-        raise _unreadable(roads, f"column {name!r} holds more than shapes") from error
-    return RoadTable(shapes, srid or None, columns)
+        raise _unreadable(roads, "a column holds more than shapes") from error
+    if taken is None:
+        raise _unreadable(roads, "none of its columns holds shapes")
+    return RoadTable(taken[0], taken[1] or None, columns)
 
 
-def _first(values: Sequence[Any]) -> Any:
+def _take_shapes(columns: dict[str, AnyArray]) -> tuple[AnyArray, int] | None:
+    """Take the column that holds WKB or WKT out of others: its shapes, and the number of their CRS, or 0; else None."""
+    name = next((name for name, values in columns.items() if _is_shape(_first(values))), None)
+    return None if name is None else _read_shapes([value if is_filled(value) else None for value in columns.pop(name)])
+
+
+def _first(values: Sequence[Any] | AnyArray) -> Any:
     """Return the first value that is one."""
-    return next((value for value in values if value is not None and value == value), None)
+    return next((value for value in values if is_filled(value)), None)
 
 
 def _unreadable(roads: Any, why: str) -> RoadSourceError:

@@ -26,7 +26,7 @@ from roadgeo.roads.kinds import KNOWN_HIGHWAYS, NO_ROADS, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, objects, simple_areas, simple_lines
 from roadgeo.storage.crs import crs_name
 
-__all__ = ["Schema", "is_known_column", "names_kinds", "recognise"]
+__all__ = ["Schema", "is_filled", "is_known_column", "names_kinds", "recognise"]
 
 #: Meanings of a word beside values of `highway`: no road, and a road of a kind that other columns may hold.
 _NONE, _ROAD = "none", "road"
@@ -145,7 +145,7 @@ class Schema:
             others |= stated == _NONE
         unknown = kinds == ""
         for name in _OTHER_KEYS:
-            others |= unknown & (_each(columns[name], _is_filled).astype(bool) if name in columns else False)
+            others |= unknown & (_each(columns[name], is_filled).astype(bool) if name in columns else False)
         said = [_tag(columns[name], _AREA) for name in _TAGS if name in columns]
         for values in said + [columns[name] for name in (_AREA,) if name in columns]:
             others |= np.array([value == "yes" for value in values], bool)
@@ -215,7 +215,7 @@ def _words_of(values: AnyArray, sure: bool = False) -> tuple[str, Mapping[str, s
 
 def _sample(values: AnyArray) -> list[Any]:
     """Return filled values from all over a column."""
-    filled = [value for value in values if _is_filled(value)]
+    filled = [value for value in values if is_filled(value)]
     return filled[:: max(len(filled) // _SAMPLE, 1)]
 
 
@@ -243,7 +243,7 @@ def _look_up(word: str, words: Mapping[str, str]) -> str | None:
 
 def _split(value: Any) -> list[str]:
     """Return the words of a value: of text with separators, as osmnx writes lists, or of a list."""
-    if not _is_filled(value):
+    if not is_filled(value):
         return []
     if isinstance(value, str):
         return [word for part in re.split(r"[;,|]", value) if (word := part.strip(" []{}()'\""))]
@@ -257,7 +257,8 @@ def _words(value: Any) -> str:
     return ";".join(_split(value)).lower()
 
 
-def _is_filled(value: Any) -> bool:
+def is_filled(value: Any) -> bool:
+    """Whether a value of a table is one, and no word for none."""
     if isinstance(value, str):
         return value.strip().lower() not in ("", "no", "none", "nan", "null")
     if isinstance(value, tuple | list | np.ndarray | set):
@@ -317,7 +318,7 @@ def _text(value: Any) -> str:
     """Return the name of a street, "" for none; of Overture's names the primary one."""
     parsed = _json(value)
     parsed = parsed.get("primary") if isinstance(parsed, dict) else value
-    return ";".join(map(str, parsed)) if isinstance(parsed, list | tuple) else str(parsed) if _is_filled(parsed) else ""
+    return ";".join(map(str, parsed)) if isinstance(parsed, list | tuple) else str(parsed) if is_filled(parsed) else ""
 
 
 def _json(value: Any) -> Any:

@@ -60,8 +60,9 @@ def list_sources(path: Path) -> list[Path]:
 
 
 def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
+    files = [file for file in files if not file.name.startswith(".")]  # nor what a Macintosh puts beside each
     candidates = [file for file in files if file.name.lower().endswith(QUERY_ENDINGS)]
-    others = [file for file in files if file not in candidates and not file.name.startswith(".")]
+    others = [file for file in files if file not in candidates]
     unread = Counter("folder" if file.is_dir() else file.suffix.lower() or "without a suffix" for file in others)
     listed = ", ".join(f"{n} {suffix}" for suffix, n in sorted(unread.items()) if not _BESIDE.fullmatch(suffix))
     if listed:
@@ -89,7 +90,9 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
         }
     for file, reason in why.items():
         _LOG.warning(
-            "%s: passed over: %s; to take it all the same give it by its name", visible(str(file)), visible(reason)
+            "%s: passed over: %s; to take it all the same give it by its name",
+            visible(str(folder / file.name)),
+            visible(reason),
         )
     kept = [file for file in candidates if file not in why]
     if not kept:
@@ -182,7 +185,7 @@ def stream_lines(
         The file is missing, unreadable, empty or holds no lines.
     """
     n, counts = 0, {"no_roads": 0, "without_places": 0}
-    with reading(path), tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
+    with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder, reading(path, folder):
         for file in _unpacked(path, Path(folder)):
             schemas: dict[frozenset[str], Schema] = {}
             for table in stream_tables(file, layer, most, advance, Path(folder), areas=areas):
@@ -246,14 +249,18 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn what goes wrong with a road file into a `RoadSourceError`."""
+def reading(path: Path, unpacked: str | None = None) -> Iterator[None]:
+    """Turn what goes wrong with a road file, or with what is unpacked of it, into a `RoadSourceError` that names it."""
     from pyproj.exceptions import ProjError
     from shapely.errors import ShapelyError
 
     require_file(path)
     try:
         yield
+    except RoadSourceError as error:
+        if unpacked is None or unpacked not in str(error):
+            raise
+        raise type(error)(str(error).replace(unpacked, str(path))) from error
     except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
         # Many libraries read such files, and a damaged one may make them raise anything.
         raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error

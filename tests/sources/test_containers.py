@@ -1,6 +1,8 @@
 """Roads that a program holds: graphs of several libraries, series, shapes."""
 
+import contextlib
 import logging
+import sqlite3
 from pathlib import Path
 
 import geopandas as gpd
@@ -146,19 +148,36 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", ["geometry", "wkb_geometry", "shape_of_it"])
+def write_sqlite(columns: dict[str, list[object]], path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        pd.DataFrame(columns).to_sql("roads", database)
+
+
+#: Files of tables that declare no shapes.
+FILES = {
+    "roads.parquet": lambda columns, path: pq.write_table(pa.table(columns), path),
+    "roads.csv": lambda columns, path: pd.DataFrame(columns).to_csv(path, index=False),
+    "semicolons.csv": lambda columns, path: pd.DataFrame(columns).to_csv(path, sep=";"),
+    "roads.csv.gz": lambda columns, path: pd.DataFrame(columns).to_csv(path),
+    "roads.sqlite": write_sqlite,
+}
+
+
+@pytest.mark.parametrize("name", ["geometry", "wkb_geometry", "shape_of_it", "WKT"])
 @pytest.mark.parametrize("shapes", SHAPES)
-@pytest.mark.parametrize("library", [*TABLES, "parquet"])
+@pytest.mark.parametrize("library", [*TABLES, *FILES])
 def test_tables_of_any_library_give_the_same_roads(tmp_path: Path, library: str, shapes: str, name: str) -> None:
     lines, highway, tunnel = streets()
     packed = [None, *SHAPES[shapes](np.array(lines))]
     columns = {"highway": [None, *highway], "tunnel": [None, *tunnel], name: packed}
     crs = None if "PostGIS" in shapes else 4326
-    if library == "parquet":
-        if name == "shape_of_it":
-            pytest.skip("by its name")
-        pq.write_table(pa.table(columns), tmp_path / "roads.parquet")
-        found = choose_roads(tmp_path / "roads.parquet", crs=crs)
+    if library in FILES:
+        if (library == "roads.parquet" and name == "shape_of_it") or (
+            library.endswith((".csv", ".csv.gz", ".sqlite")) and shapes == "WKB"
+        ):
+            pytest.skip("known by its name alone, or kept as text")
+        FILES[library](columns, tmp_path / library)
+        found = choose_roads(tmp_path / library, crs=crs)
     else:
         found = choose_roads(TABLES[library](columns), crs=crs)
     right = choose_roads(gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs=CRS))

@@ -2,9 +2,12 @@
 
 import gzip
 import json
+import re
+import zipfile
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from worlds.fenway import streets, write_streets, write_vector
@@ -118,7 +121,7 @@ def test_a_folder_is_read_whole_or_says_what_it_passes_over(tmp_path, more, firs
         written = write_vector(tmp_path / f"b.{name}", lines, highway=highway)
         content = written.read_bytes()
         (folder / f"b.{more}").write_bytes(gzip.compress(content) if more.endswith("gz") else content)
-    for name in ("c.dwg", "d.xlsx", "e.osc", "f.mbtiles", "g.geojson.xz", "notes.txt", "a.prj", ".hidden"):
+    for name in ("c.dwg", "d.xlsx", "e.osc", "f.mbtiles", "g.geojson.xz", "notes.txt", "a.prj", ".hidden", "._a.gpkg"):
         (folder / name).write_bytes(b"x")
     (folder / "older").mkdir()
     assert len(list_sources(folder)) == 2
@@ -136,13 +139,18 @@ def test_a_json_that_is_something_else_is_passed_over(tmp_path, caplog):
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.999])
 @pytest.mark.parametrize(
     "name",
-    ["a.shp", "a.geojsonl", "a.ndjson", "a.geojson", "a.gpkg", "a.fgb", "a.gml", "a.kml", "a.parquet", "a.osm.pbf"],
+    [
+        *("a.shp", "a.geojsonl", "a.ndjson", "a.geojson", "a.gpkg", "a.fgb", "a.gml", "a.kml", "a.parquet"),
+        *("a.osm.pbf", "a.csv"),
+    ],
 )
 def test_a_file_that_is_cut_off_is_refused(tmp_path, name, share):
     lines, highway, _ = streets()
     path = tmp_path / name
     if name in ("a.parquet", "a.osm.pbf"):
         write_streets(path)
+    elif name == "a.csv":
+        pd.DataFrame({"highway": highway, "WKT": shapely.to_wkt(lines)}).to_csv(path, index=False)
     else:
         table = gpd.GeoDataFrame({"highway": highway}, geometry=lines, crs=4326)
         drivers = {"ndjson": "GeoJSONSeq", "geojsonl": "GeoJSONSeq", "gml": "GML", "kml": "KML", "fgb": "FlatGeobuf"}
@@ -152,3 +160,30 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path, name, share):
     path.write_bytes(whole[: min(int(share * len(whole)), len(whole) - 2)])
     with pytest.raises(RoadSourceError, match=r"cut off|damaged|not readable"):
         read_lines(path)
+
+
+@pytest.mark.parametrize("name", ["a.gpkg", "a.shp", "a.geojson", "a.csv", "a.osm.pbf", "a.osm", "a.parquet", "a.kml"])
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"", "is empty"),
+        (b"\n<!DOCTYPE html><html><body>404</body></html>", "is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS"),
+    ],
+)
+def test_what_came_in_place_of_a_file_is_named(tmp_path, name, content, word):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RoadSourceError, match=word):
+        read_lines(tmp_path / name)
+
+
+def test_an_archive_of_a_macintosh_is_read_and_errors_name_it(tmp_path):
+    lines, highway, _ = streets()
+    whole = write_vector(tmp_path / "a.gpkg", lines, highway=highway).read_bytes()
+    for name, content in (("whole.zip", whole), ("cut.zip", whole[:-9000])):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.writestr("a.gpkg", content)
+            archive.writestr("__MACOSX/._a.gpkg", b"\0\5\x16\7")
+    assert len(read_lines(tmp_path / "whole.zip").lines) == len(lines)
+    with pytest.raises(RoadSourceError, match=re.escape(str(tmp_path / "cut.zip" / "a.gpkg"))):
+        read_lines(tmp_path / "cut.zip")
