@@ -1,5 +1,6 @@
 """Numbers that pages take from the code, or from another page, are those that stand there."""
 
+import csv
 import re
 
 import numpy as np
@@ -55,11 +56,7 @@ FROM_CODE = [
         r"below ([\d.]+) or above (\d+) m \(`--gsd`\), more than (\d+) degrees",
         (*CAMERA.gsd_m, CAMERA.max_tilt_deg),
     ),
-    (
-        "docs/tutorial.md",
-        r"Pixels below ([\d.]+) or above (\d+) metres need `--gsd`, tilts of (\d+) degrees",
-        (*CAMERA.gsd_m, CAMERA.max_tilt_deg),
-    ),
+    ("docs/commands/locate.md", r"Needed below ([\d.]+) and above (\d+) ", CAMERA.gsd_m),
     ("docs/glossary.md", r"its score is ([\d.]+) or more", NEEDED),
     ("docs/scale.md", r"map of more than ([\d,]+) intersections a place also", triples._USUAL_SIZE),
     ("docs/commands/locate.md", r"`--max-tilt 20` \| the default is (\d+)", CAMERA.max_tilt_deg),
@@ -152,6 +149,18 @@ def test_pages_state_the_numbers_of_the_code():
 def test_pages_state_the_numbers_of_other_pages():
     stated = [(said(page, sentence), said(source, there)) for page, sentence, source, there in FROM_PAGES]
     assert [here for here, _ in stated] == [there for _, there in stated]
+
+
+def test_the_page_of_verify_counts_its_kept_results():
+    with (ROOT / "examples/verify/results/grids_seed77.csv").open(newline="") as file:
+        rows = [(float(row["off_m"]), row["verdict"]) for row in csv.DictReader(file)]
+    near = [verdict for off_m, verdict in rows if 0.0 <= off_m <= 100.0]
+    far = [verdict for off_m, verdict in rows if off_m >= 500.0]
+    counted = len(far), len(near) - near.count("unknown"), len(near), set(far)
+    none_of, *judged = said(
+        "docs/commands/verify.md", r"none of (\d+) is judged. 0, 30 and 100 m off (\d+) of (\d+) are judged"
+    )
+    assert (int(none_of), *map(int, judged), {"unknown"}) == counted
 
 
 def test_the_table_of_error_rates_is_that_of_results():
