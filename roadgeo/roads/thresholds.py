@@ -151,7 +151,7 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
         return None, f"holds the values {listed}: {other:g} is taken for road"
     if are_two:
         return other, f"holds the values {listed}: 1 is taken for road, {other:g} for not observed"
-    if other > 0 and sample.observed.dtype.kind in "iu":
+    if other > 0 and sample.observed.dtype.kind in "iu" and not are_roads(rows != other):
         _refuse_classes(replace(sample, observed=sample.observed[values != other]), classes)
     return None, ""
 
@@ -163,18 +163,22 @@ def are_labels(values: AnyArray) -> bool:
 
 
 def find_numbered(sample: Sample) -> float | None:
-    """Return the threshold of a mask whose roads have numbers, such as instances, lanes, speeds or years; else None."""
+    """Return the threshold of a mask whose roads have numbers, such as instances, lanes, speeds or years; else None.
+
+    Its ground is the least value, of none above 0, or the greatest.
+    """
     levels = sample.levels
-    is_plain = len(levels) > 2 and levels[0] == 0 and not np.any(levels != np.round(levels)) and not are_labels(levels)
-    if not is_plain or (sample.observed.shape[1] > 1 and np.ptp(sample.observed, axis=1).any()):
+    if len(levels) < 3 or are_labels(levels) or np.ptp(sample.observed, axis=1).any():
         return None
-    rows = sample.read_rows()
-    return float(levels[1]) / 2 if are_patches(rows, rows > 0) and are_roads(rows > 0) else None
+    rows, (low, high) = sample.read_rows(), (levels[:2], levels[-2:])
+    pairs = ((low[0], low), (high[1], high))[int(low[0] > 0) :]
+    grounds = ((rows != ground, float(np.mean(pair))) for ground, pair in pairs)
+    return next((middle for shown, middle in grounds if are_patches(rows, shown) and are_roads(shown)), None)
 
 
 def are_patches(values: AnyArray, shown: BoolArray) -> bool:
-    """Whether neighbours among the (rows, columns) shown mostly have one value, of several whole ones."""
-    if not shown.any() or np.any(values[shown] % 1):
+    """Whether neighbours among the (rows, columns) shown mostly have one value, of several that are no shares of 1."""
+    if not shown.any() or (np.any(values[shown] % 1) and values[shown].max() <= 1):
         return False
     levels, counts = np.unique(values[shown], return_counts=True)
     common = values == levels[np.argmax(counts)]

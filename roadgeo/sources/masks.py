@@ -204,7 +204,7 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
         raster, sample = _without_unlabelled(raster, sample)
     number = find_numbered(sample) if threshold is None else None
     if number is not None:
-        _LOG.warning("%s: holds a number for each of its roads: all above 0 is road", visible(raster.name))
+        _LOG.warning("%s: holds a number for each of its roads: all but its ground is road", visible(raster.name))
     threshold = threshold if number is None else number
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
     levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
@@ -295,18 +295,22 @@ def _without_fill(raster: Bands, observed: AnyArray) -> Bands:
 
 
 def _of_colours(raster: Bands) -> Bands:
-    """Take all but black for road where each road has a colour of its own."""
-    if len(raster.bands) == 1:
-        return raster
+    """Take all but the ground, which is black or white, for road where each road has a colour of its own."""
     values, valid = _middle(raster)
-    shown = (values > 0).any(axis=2) & _finite(values, valid)
-    if values.dtype.kind not in "iu" or not np.ptp(values[shown], axis=1).any() or not are_roads(shown):
+    if values.shape[2] == 1 or values.dtype.kind not in "iu":
         return raster
-    if not are_patches(values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]], shown):
-        return raster
-    _LOG.warning("%s: holds a colour for each of its roads: all but black is road", visible(raster.name))
-    drawn = _changed(raster, lambda values, valid: (np.any(values > 0, axis=2, keepdims=True).view(np.uint8), valid))
-    return replace(drawn, bands=raster.bands[:1])
+    for ground in (0, np.iinfo(values.dtype).max):
+        shown = (values != ground).any(axis=2) & _finite(values, valid)
+        packed = values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]]
+        if np.ptp(values[shown], axis=1).any() and are_roads(shown) and are_patches(packed, shown):
+            _LOG.warning("%s: holds a colour for each of its roads: all but its ground is road", visible(raster.name))
+            drawn = _changed(raster, partial(_unlike, ground))
+            return replace(drawn, bands=raster.bands[:1])
+    return raster
+
+
+def _unlike(ground: int, values: AnyArray, valid: BoolArray | None) -> _Rows:
+    return (values != ground).any(axis=2, keepdims=True).view(np.uint8), valid
 
 
 def _all_but(fill: float, values: AnyArray, valid: BoolArray | None) -> _Rows:

@@ -702,12 +702,13 @@ def numbered(roads: np.ndarray, kind: str) -> np.ndarray:
         "speeds": np.array([30, 50, 90])[bands % 3],
         "years": 1990 + bands,
         "float years": 1990.0 + bands,
+        "miles": np.array([30, 50, 90])[bands % 3] * 1.609,
     }[kind]
-    types = {"years": "uint16", "float years": "float32"}
+    types = {"years": "uint16", "float years": "float32", "miles": "float64"}
     return (roads * numbers).astype(types.get(kind, "uint8"))
 
 
-NUMBERED = ["instances", "many", "lanes", "speeds", "years", "float years"]
+NUMBERED = ["instances", "many", "lanes", "speeds", "years", "float years", "miles"]
 
 
 @pytest.mark.parametrize("container", ["array", "tif", "png", "nodata", "masked", "rgb", "colours", "palette"])
@@ -716,7 +717,9 @@ def test_numbers_above_0_are_road(
     roads: np.ndarray, kind: str, container: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     values = numbered(roads, kind)
-    if (container == "png" and kind == "float years") or (container == "palette" and "years" in kind):
+    if (container == "png" and kind in ("float years", "miles")) or (
+        container == "palette" and ("years" in kind or kind == "miles")
+    ):
         pytest.skip("no such file")
     path = tmp_path / "a.png"
     if container == "png":
@@ -739,6 +742,23 @@ def test_numbers_above_0_are_road(
     found = read_mask(source, voids=False)
     np.testing.assert_array_equal(found.roads, roads)
     assert "road" in caplog.text
+
+
+@pytest.mark.parametrize("container", ["array", "tif", "rgb", "colours"])
+@pytest.mark.parametrize("ground", [-1, 255, 65535, -9999])
+@pytest.mark.parametrize("kind", NUMBERED)
+def test_the_ground_between_numbers_may_be_any(
+    roads: np.ndarray, kind: str, ground: int, container: str, tmp_path: Path
+) -> None:
+    values = np.where(roads, numbered(roads, kind).astype("float64" if kind == "miles" else "int32"), ground)
+    colours = np.random.default_rng(1).integers(0, 255, (4000, 3))[values.astype(int) % 4000]
+    source = {
+        "array": lambda: values,
+        "tif": lambda: write_raster(tmp_path / "a.tif", values),
+        "rgb": lambda: np.dstack([values] * 3),
+        "colours": lambda: np.where(roads[..., None], colours, 255).astype(np.uint8),
+    }[container]()
+    np.testing.assert_array_equal(read_mask(source, voids=False).roads, roads)
 
 
 @pytest.mark.parametrize("kind", ["nodata", "nan", "masked", "minus infinity", "alpha"])
