@@ -37,7 +37,7 @@ _DARKEST, _LIGHTEST = 8, 245  # of stretched values
 #: 8-bit values that span less, but for half a hundredth at either end, are stretched: night, haze, a flat scan.
 _FEW_VALUES = 64
 _SHOWN_SHARE = 0.1  # of a frame that lies within margins and is not filled, at least
-_FILL_PATCH_PX, _MANY_VALUES = 5, 9
+_FILL_PATCH_PX, _FILL_AREA_PX, _MANY_VALUES = 5, 400, 9
 #: A line of a margin has one value, but for paper's grain (share of the range of values in the middle of the frame)
 #: and for what is written there (share of the line).
 _GRAIN, _PLAIN_SHARE = 0.04, 0.9
@@ -200,9 +200,7 @@ class _Tones:
 
     def rgb(self, values: AnyArray) -> AnyArray:
         """Return (H, W, B) values as (H, W, 3) RGB."""
-        if self.palette is not None:
-            colours: AnyArray = self.palette[values[..., 0]]
-            return colours
+        values = values if self.palette is None else self.palette[values[..., 0]]
         shown = values if self.span is None else self._stretched(values, *self.span)
         for fill, plain in self.fills:
             shown = np.where(_patches_of(fill, values)[..., None], np.uint8(plain), shown)
@@ -226,13 +224,11 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
     if not valid.any():
         raise MaskError(f"{name}: holds no observed pixel; give a photograph that shows ground")
     if palette is not None:
-        exact = palette[exact[..., 0]]
+        exact, sample = (palette[values[..., 0]] for values in (exact, sample))
     rows, columns = _within_margins(exact, valid)
     box = _Box(columns.start * scale, rows.start * scale, columns.stop * scale, rows.stop * scale)
     _report_margins(name, box, (width, height))
     exact, sample, valid = (values[rows, columns] for values in (exact, sample, valid))
-    if palette is not None:
-        return _Tones(palette), box
     fills = _find_fills(name, exact, valid)
     shown = valid & ~np.any([(exact == fill).all(axis=2) for fill in fills], axis=0) if fills else valid
     observed = sample[shown].astype(np.float64)
@@ -240,7 +236,7 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
     is_8_bit = dataset.dtypes[bands[0] - 1] == "uint8"
     keeps = is_8_bit and not 0 < np.ptp(np.percentile(observed, [0.5, 99.5])) < _FEW_VALUES
     plain = [(fill, 255 if fill.min() > (_WHITE if keeps else high) else 0) for fill in fills]
-    return _Tones(None, None if keeps else (low, high), plain), box
+    return _Tones(palette, None if keeps else (low, high), plain), box
 
 
 def _within_margins(values: AnyArray, valid: BoolArray) -> tuple[slice, slice]:
@@ -279,14 +275,20 @@ def _report_margins(name: str, box: _Box, size: tuple[int, int]) -> None:
 
 
 def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> list[AnyArray]:
-    """Return the (B,) colours that (H, W, B) values have in large patches: the least, the greatest, a corner's."""
+    """Return the (B,) colours that (H, W, B) values have in patches: the least, the greatest, a corner's.
+
+    Patches are large, but where the colour lies far from all others, or in several corners.
+    """
     seen, fills = values[valid], []
     corners = values[[0, 0, -1, -1], [0, -1, 0, -1]]
     for fill in np.unique([np.full_like(seen[0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
-        is_fill = find_voids((values == fill).all(axis=2) & valid)
-        others = valid & ~is_fill
-        is_picture = others.sum() >= _SHOWN_SHARE * valid.sum() and len(np.unique(values[others])) >= _MANY_VALUES
-        if is_fill.any() and is_picture:
+        rest = seen[(seen != fill).any(axis=1)].astype(np.float64)
+        if len(np.unique(rest)) < _MANY_VALUES:
+            continue
+        is_apart = max(rest.min() - float(fill.max()), float(fill.min()) - rest.max()) > np.ptp(rest)
+        is_sure = is_apart or np.count_nonzero((corners == fill).all(axis=1)) > 1
+        is_fill = find_voids((values == fill).all(axis=2) & valid, least=_FILL_AREA_PX if is_sure else None)
+        if is_fill.any() and (valid & ~is_fill).sum() >= _SHOWN_SHARE * valid.sum():
             fills.append(fill)
             shown = ", ".join(f"{value:g}" for value in np.unique(fill))
             _LOG.warning("%s: areas of the value %s are taken for not observed", visible(name), shown)
@@ -314,13 +316,13 @@ def find_ground(photograph: Photograph, shape: tuple[int, int]) -> BoolArray:
     return ground
 
 
-def find_voids(*plain: BoolArray) -> BoolArray:
+def find_voids(*plain: BoolArray, least: int | None = None) -> BoolArray:
     """Return (H, W) where there is no photograph, given where it is as good as white, as good as black, a fill.
 
-    Only large plain areas count; a little of their edge, which is smeared, goes with them.
+    Only large plain areas count, of at least so many pixels; a little of their edge, which is smeared, goes with them.
     """
     void = np.zeros(plain[0].shape, np.uint8)
-    least = min(_VOID_AREA_PX, void.size // 10)
+    least = least or min(_VOID_AREA_PX, void.size // 10)
     for one in plain:
         if np.count_nonzero(one) < least:
             continue

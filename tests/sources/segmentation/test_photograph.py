@@ -105,6 +105,39 @@ def test_margins_do_not_count_where_few_values_are_stretched(
     assert np.ptp(np.percentile(rgb[INSIDE], [5, 95])) > 130
 
 
+@pytest.mark.parametrize("reader", ["geotiff.tif", "png.png", "alpha.tif", "mask_band.tif", "page.tif"])
+@pytest.mark.parametrize(
+    ("kind", "fill", "low", "high"),
+    [
+        *(("uint8", 255, 0, 30), ("uint8", 0, 100, 130), ("uint8", 255, 200, 240), ("uint16", 65535, 300, 900)),
+        *(("uint16", 0, 20000, 22000), ("int16", -9999, 0, 4000), ("float32", -9999.0, 0.0, 0.2)),
+    ],
+)
+def test_nor_do_small_corners_of_a_turned_picture(
+    tmp_path: Path, reader: str, kind: str, fill: float, low: float, high: float
+) -> None:
+    if kind not in ("uint8", "uint16") and reader != "geotiff.tif":
+        pytest.skip("no such file")
+    values = framed(fill, kind, low, high)[INSIDE]
+    y, x = (np.minimum(at, at[::-1, ::-1]) for at in np.indices(values.shape))
+    values[x + y < 60] = fill
+    path = READERS[reader](tmp_path / reader, values)
+    with open_photograph(path) as opened:
+        rgb, _ = opened.read(0.0, 0.0, 400.0, 300.0, (300, 400))
+    assert np.ptp(np.percentile(rgb[60:-60, 60:-60, 0], [5, 95])) > 130
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 30), (100, 130), (225, 250)])
+@pytest.mark.parametrize("suffix", ["tif", "png", "gif"])
+def test_few_colours_of_a_palette_are_stretched(tmp_path: Path, suffix: str, low: float, high: float) -> None:
+    import PIL.Image
+
+    PIL.Image.fromarray(framed(0, "uint8", low, high)[INSIDE]).convert("P").save(tmp_path / f"a.{suffix}")
+    with open_photograph(tmp_path / f"a.{suffix}") as opened:
+        rgb, _ = opened.read(0.0, 0.0, 400.0, 300.0, (300, 400))
+    assert np.ptp(np.percentile(rgb, [5, 95])) > 130
+
+
 def test_margins_may_have_grain_and_writing_and_a_line(tmp_path: Path) -> None:
     """As a print scanned on its sheet, with a number beside it and a line around it."""
     values = framed(236)
