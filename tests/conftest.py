@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
@@ -11,14 +12,23 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 if TYPE_CHECKING:
     from roadgeo.matching.index import ReferenceIndex
     from roadgeo.roads.network import RoadNetwork
 
 # Whoever starts the tests in the background hands down an ignored SIGINT, and with it children that Ctrl-C cannot stop.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# Where a machine keeps no compiled modules, each program that a test starts would compile them all anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # The same examples in every run: what a random one finds once is no reason for another change to fail.
 settings.register_profile("steady", derandomize=True, deadline=None)
+settings.register_profile("brief", settings.get_profile("steady"), max_examples=30)
 settings.load_profile("steady")
 
 
@@ -58,10 +68,23 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if names_files(config) and config.option.markexpr == "not nightly":
+    if names_files(config) and leaves_out(config):
         config.option.markexpr = ""  # and whole
+    if leaves_out(config):
+        settings.load_profile("brief")
     if config.getoption("measure") and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Measure())
+
+
+def leaves_out(config: pytest.Config) -> bool:
+    """Whether what is nightly is left out."""
+    return config.option.markexpr == "not nightly"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files whose tests are all nightly are not even read."""
+    path = f"{collection_path.relative_to(config.rootpath).as_posix()}{'/' if collection_path.is_dir() else ''}"
+    return True if path in NIGHTLY and leaves_out(config) else None
 
 
 def pytest_report_header() -> str:
@@ -154,6 +177,13 @@ def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from roadgeo.sources.roads import read_roads
     from roadgeo.workflows import build_reference
 
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
+    base = tmp_path_factory.getbasetemp()
+    is_shared = fcntl is not None and "PYTEST_XDIST_WORKER" in os.environ  # by all processes; the first builds it
+    path = (base.parent if is_shared else base) / "reference" / "porto.gpkg"
+    path.parent.mkdir(exist_ok=True)
+    with path.with_suffix(".lock").open("w") as lock:
+        if is_shared:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.with_suffix(".index").exists():
+            build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
     return path

@@ -58,19 +58,17 @@ def answers(folder):
 
 
 def test_evaluate_gives_the_same_figures_however_it_is_run(town, tmp_path, capsys):
-    options = ["-n", 4, "--noise", "clean", "--noise", "poor", "--mirrored", 2, *SMALL, "-q"]
-    runs = {"once": [], "again": [], "by two": ["-j", 2]}
-    for name, jobs in runs.items():
+    options = ["-n", 2, "--noise", "clean", "--noise", "poor", "--mirrored", 1, *SMALL, "-q"]
+    for name, jobs in {"once": [], "by two": ["-j", 2]}.items():
         assert run("evaluate", town, *options, *jobs, "-o", tmp_path / name) == 0
     once = json.loads((tmp_path / "once" / "evaluation.json").read_text())
-    assert once["total"]["queries"] == len(once["scores"]) == 10
-    assert once["breakdowns"]["kind"][0]["recall"]["hits"] == 4
-    assert once["total"]["refused"]["hits"] == 2
+    assert once["total"]["queries"] == len(once["scores"]) == 5
+    assert once["breakdowns"]["kind"][0]["recall"]["hits"] == 2
+    assert once["total"]["refused"]["hits"] == 1
     assert once["total"]["compute_s"]["median"] > 0
-    assert len(answers(tmp_path / "once")) == 11
-    for name in ("again", "by two"):
-        assert figures(json.loads((tmp_path / name / "evaluation.json").read_text())) == figures(once)
-        assert answers(tmp_path / name) == answers(tmp_path / "once")
+    assert len(answers(tmp_path / "once")) == 6
+    assert figures(json.loads((tmp_path / "by two" / "evaluation.json").read_text())) == figures(once)
+    assert answers(tmp_path / "by two") == answers(tmp_path / "once")
     assert (tmp_path / "once" / "report.html").is_file()
 
     assert run("evaluate", town, *options, "--json", "-o", tmp_path / "once") == 0  # from the record

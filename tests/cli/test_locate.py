@@ -391,7 +391,7 @@ def test_the_style_of_a_mask_does_not_colour_the_photograph(porto: Path) -> None
 
 def test_what_is_missing_of_an_earlier_result_is_made_anew(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     shutil.copy(MASKS["drone"].path, "a.png")
-    locate = ["locate", "a.png", "-r", str(porto), "--report", "--plot", "--skip-existing"]
+    locate = ["locate", "a.png", "-r", str(porto), "--plot", "--skip-existing"]
     assert main(locate[:-1]) == 0
     capfd.readouterr()
     for lost in ("a_overlay.png", "a_location.gpkg"):
@@ -399,9 +399,9 @@ def test_what_is_missing_of_an_earlier_result_is_made_anew(porto: Path, capfd: p
         assert main(locate) == 0
         assert "before" not in capfd.readouterr().out
         assert Path(lost).stat().st_size
-    Path("a_report.html").write_bytes(b"")  # as after a power cut
+    Path("a_overlay.png").write_bytes(b"")  # as after a power cut
     assert main(locate) == 0
-    assert Path("a_report.html").stat().st_size
+    assert Path("a_overlay.png").stat().st_size
     capfd.readouterr()
     assert main(locate) == 0
     assert capfd.readouterr().out == "a.png: located before\n"

@@ -42,12 +42,21 @@ class Places(UserDict):
 
 
 @pytest.fixture(scope="session")
-def shelf(tmp_path_factory):
-    """A folder with all that readers are told to have: the demonstration's, and stand-ins for files of their own."""
-    folder = tmp_path_factory.mktemp("shelf")
+def demonstrated(tmp_path_factory):
+    """The folder that the demonstration makes, for pages that begin after it."""
+    folder = tmp_path_factory.mktemp("demonstrated")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert main(["demo"]) == 0
+    return folder / "roadgeo_demo"
+
+
+@pytest.fixture(scope="session")
+def shelf(tmp_path_factory):
+    """A folder with all that readers are told to have: stand-ins for files of their own."""
+    folder = tmp_path_factory.mktemp("shelf")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
         write_streets(folder / "massachusetts.osm.pbf")
         lines, highway, tunnel = streets()
         roads = gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs="EPSG:4326")
@@ -89,8 +98,10 @@ def desk(shelf, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_page_does_what_it_says(page: str, desk: Path) -> None:
+def test_a_page_does_what_it_says(page: str, desk: Path, request: pytest.FixtureRequest) -> None:
     """Its blocks run in order in one folder, end as it says, print what it shows, and leave the files it names."""
+    if "roadgeo_demo" in PAGES[page] and "\nroadgeo demo\n" not in PAGES[page]:
+        shutil.copytree(request.getfixturevalue("demonstrated"), desk / "roadgeo_demo")
     left_out = {block.line for block in blocks(PAGES[page]) if block.text.startswith(ELSEWHERE)}
     with fake_osm() as osm:
         osm.places = Places()

@@ -1,6 +1,7 @@
 """Flights whose link fails: frames that are repeated or missing, and an aircraft that is displaced meanwhile."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -75,7 +76,8 @@ def test_a_place_that_the_roads_contradict_is_not_sent(video, monkeypatch):
     flight, reference = video
     monkeypatch.setattr(Tracker, "_search_around", lambda *_: None)
     tracker = Tracker([reference])
-    first = [tracker.feed(frame)[-1] for frame in frames_of(with_fault(flight, "missing", 9, 4), held=9)]
+    frames = islice(frames_of(with_fault(flight, "missing", 9, 4), held=9), 12)
+    first = [tracker.feed(frame)[-1] for frame in frames]
     assert [state.status for state in first[8:12]] == ["tracked", "predicted", "predicted", "lost"]
     assert [fix_of(row.to_dict(), 0.0) for row in make_rows(first[9:12])] == [None] * 3
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from pyproj import CRS, Geod
 
@@ -85,7 +85,6 @@ def test_the_plane_is_a_shift_of_its_crs():
     np.testing.assert_allclose(plane.to_crs_matrix() @ [12.5, -7.25, 1], [*plane.to_crs(xy)[0], 1])
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-180, 180), st.floats(-89, 89), st.floats(0.01, 15), st.floats(0.01, 10))
 def test_any_region_goes_there_and_back_with_true_angles(lon, lat, width, height):
     assume(abs(lat) + height / 2 < 89.5)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive import kernels as naive
 
@@ -48,7 +48,6 @@ def test_points_on_one_another_and_on_a_line():
     check([[float(x), 7.0] for x in range(30)], 4)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(-50, 50), st.integers(-50, 50)), min_size=1, max_size=40), st.integers(1, 9))
 def test_any_lattice_points(points, k):
     check(points, k, 7.0)

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive import thinning as naive
 from scipy import ndimage
@@ -44,7 +44,6 @@ def random_states(draw: st.DrawFn) -> np.ndarray:
     return np.pad(states, 1, constant_values=SOLID)
 
 
-@settings(deadline=None, max_examples=200)
 @given(random_states(), st.sampled_from([0.0, 1.0, 1.5, 3.0]))
 def test_thin_equals_its_slow_twin(states: np.ndarray, min_end_depth: float) -> None:
     expected = states.copy()

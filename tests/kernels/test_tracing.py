@@ -4,7 +4,7 @@ from collections import Counter
 
 import cv2
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from kernels.test_thinning import depth, framed, random_states
 from naive import tracing as naive
@@ -20,7 +20,6 @@ def traced(states: np.ndarray) -> Traced:
     return trace(states, pixels, np.empty(states.size, np.int32))
 
 
-@settings(deadline=None, max_examples=200)
 @given(random_states())
 def test_trace_equals_its_slow_twin(states: np.ndarray) -> None:
     thin(states, depth(states), 1.0)
@@ -63,7 +62,6 @@ def test_nothing_to_trace() -> None:
     assert offsets.tolist() == [0]
 
 
-@settings(deadline=None, max_examples=100)
 @given(random_states(), st.integers(0, 4), st.integers(1, 4), st.integers(0, 9))
 def test_smooth_chains_equals_its_slow_twin(states: np.ndarray, passes: int, spacing: int, trim: int) -> None:
     distance = np.minimum(depth(states), 100)

@@ -231,6 +231,36 @@ def test_matches_are_the_nearest_of_their_type(reference, index):
         np.testing.assert_array_equal(found, expected)
 
 
+def test_of_two_that_come_near_one_the_nearer_matches_it(reference, index):
+    truth = camera(np.random.default_rng(2), (2000, 2000))
+    query, seen = view(reference, truth)
+    twice = query.only(np.r_[0, np.arange(len(query))])
+    twice.xy[0] += 3.0
+    matched = searching(twice, index, PairOptions(), None).matches(truth.matrix)
+    np.testing.assert_array_equal(matched, np.column_stack([1 + np.arange(len(seen)), seen]))
+
+
+def test_more_than_the_share_must_match(reference, index):
+    truth = camera(np.random.default_rng(2), (2000, 2000))
+    query, _ = view(reference, truth)
+    query = query.only(np.arange(len(query) // 2 * 2))
+    for lost, row in ((len(query) // 2, -1), (len(query) // 2 - 1, 0)):
+        xy = query.xy.copy()
+        xy[:lost] += 1e6
+        search = searching(replace(query, xy=xy), index, PairOptions(), None)
+        assert search.count(truth.matrix[None], search.best)[1] == row
+
+
+def test_rare_types_come_first_and_equal_ends_are_tried_both_ways(reference, index):
+    rng = np.random.default_rng(4)
+    search = searching(view(reference, camera(rng, (2000, 2000), 20), rng)[0], index, PairOptions(), rng)
+    drawn = search.draw_query_tuples()
+    counts = [len(index.tuples[key].pairs) for _, key in drawn]
+    assert counts == sorted(counts)
+    (a, b), key = next((ends, key) for ends, key in drawn if key == PLAIN)
+    assert [way.ends.tolist() for way in search.correspondences(a, b, key)] == [[a, b], [b, a]]
+
+
 def evaluate(search, correspondence, row, least=-1):
     """The inlier count and homography of one candidate."""
     search.options = replace(search.options, one_to_one=False)

@@ -36,6 +36,20 @@ def test_bent_branches_are_discarded_and_straight_ones_kept(index, from_center):
     assert good[inside & ~bent].all()
 
 
+def test_the_average_distance_from_the_line_has_a_limit():
+    """A street in curves, and others that cross it."""
+    x = np.arange(-50.0, 1051.0, 5.0)
+    streets = [LineString([(x, -50), (x, 150)]) for x in np.arange(6) * 200.0]
+    index = build_index(
+        build_network([LineString(np.column_stack([x, 15.0 * np.sin(x / 37.0)])), *streets], PLANE, {"name": "c"})
+    )
+    at, _, error = pairs._fit_lines(index, 8.0, 15)
+    worst = np.array([error[at == n].max() for n in range(len(index))])
+    limit = 0.7 * worst.max()
+    np.testing.assert_array_equal(kept(index, fit_error_px=limit), worst <= limit)
+    assert limit > 0.01
+
+
 def test_branches_too_short_to_fit_are_discarded(index):
     assert not kept(index, n_px=3000).any()
 

@@ -59,18 +59,16 @@ def bin_segments(segments, grid, shape):
 
 def nearest_road(x, y, dx, dy, radius, min_cos, segments):
     """(distance, foot, direction) of the nearest road alike in direction, among all."""
-    best = (np.inf, np.zeros(2), np.zeros(2))
-    for x1, y1, x2, y2 in segments.astype(float):
-        start, step = np.array([x1, y1]), np.array([x2 - x1, y2 - y1])
-        length = np.hypot(*step)
-        if length == 0 or abs(step @ (dx, dy)) < min_cos * length:
-            continue
-        t = np.clip((np.array([x, y]) - start) @ step / length**2, 0, 1)
-        foot = start + t * step
-        distance = np.hypot(*(foot - (x, y)))
-        if distance < min(best[0], radius):
-            best = (distance, foot, step / length)
-    return best
+    start, stop = np.split(segments.astype(float), 2, axis=1)
+    step = stop - start
+    length = np.hypot(*step.T)
+    is_alike = (length > 0) & (abs(step @ (dx, dy)) >= min_cos * length)
+    start, step, length = start[is_alike], step[is_alike], length[is_alike, None]
+    t = (((x, y) - start) * step).sum(axis=1, keepdims=True) / length**2
+    foot = start + np.clip(t, 0, 1) * step
+    distance = np.append(np.hypot(*(foot - (x, y)).T), radius)
+    k = distance.argmin()
+    return (distance[k], foot[k], (step / length)[k]) if distance[k] < radius else (np.inf, np.zeros(2), np.zeros(2))
 
 
 def meets_road(x, y, dx, dy, radius, min_cos, segments):

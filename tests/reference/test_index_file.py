@@ -95,7 +95,7 @@ plain = st.recursive(
     meta=st.dictionaries(st.text(), plain, max_size=5),
     array=hnp.arrays(st.sampled_from(list(index_file._DTYPES.values())), hnp.array_shapes(min_dims=0, min_side=0)),
 )
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_plain_values_and_arrays_come_back(tmp_path: Path, meta: dict[str, Any], array: np.ndarray) -> None:
     if array.ndim > 4:
         return
@@ -362,7 +362,7 @@ def test_hand_made_pickles_are_refused_and_cost_little_memory(path: Path, pickle
 
 
 @given(pickled=st.binary(max_size=60))
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None:
     forge_pickle(path, HEAD + b"}" + pickled + b".")
     try:

@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pyogrio
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from worlds.networks import grid_network, same_values
 
@@ -67,7 +67,6 @@ def test_round_trip_is_exact(path: Path, network: RoadNetwork) -> None:
     xy=st.lists(st.floats(-2e6, 2e6), min_size=2, max_size=2),
     origin=st.tuples(st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7)),
 )
-@settings(deadline=None)
 def test_stored_positions_are_fixed_points(xy: list[float], origin: tuple[int, int]) -> None:
     plane = LocalPlane("EPSG:32619", (float(origin[0]), float(origin[1])))
     graph = RoadGraph.from_polylines(np.array([xy]), np.array([[0, 0]]), [np.array([xy, xy])])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -14,7 +14,6 @@ KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
 
 
 @given(st.data())
-@settings(max_examples=150)
 def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:
     kind = data.draw(KINDS)
     numbers = st.floats(-(2.0**100), 2.0**100, width=32) if np.dtype(kind).kind == "f" else None

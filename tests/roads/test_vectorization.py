@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -197,7 +197,6 @@ def test_all_road_is_an_error() -> None:
         vectorize(RoadMask(np.ones((50, 50), bool)))
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1.0, 2.0, 4.0]), st.floats(0.02, 0.6), st.booleans())
 def test_any_noise_gives_a_sound_graph(seed: int, scale: float, share: float, unseen: bool) -> None:
     rng = np.random.default_rng(seed)

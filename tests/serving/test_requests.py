@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from starlette.exceptions import HTTPException
 
@@ -68,7 +68,6 @@ VALUES = st.recursive(
 
 
 @given(st.dictionaries(HINTS, VALUES, max_size=4))
-@settings(max_examples=40)
 def test_any_hints_are_finite_numbers_or_refused(values):
     try:
         found = read_hints(values.items())

@@ -125,9 +125,19 @@ def test_folders_of_one_relative_name_are_each_cleared(tmp_path: Path, monkeypat
 def test_foreign_files_of_similar_names_stay(tmp_path: Path) -> None:
     (tmp_path / ".roadgeo-notes.tmp").mkdir()
     (tmp_path / ".roadgeo-notes.tmp" / "mine.txt").touch()
+    (tmp_path / ".roadgeo-empty.tmp").mkdir()
     (tmp_path / "x.tmp").touch()
     write_text(tmp_path / "a.txt", "")
-    assert {path.name for path in tmp_path.iterdir()} == {".roadgeo-notes.tmp", "a.txt", "x.tmp"}
+    names = {".roadgeo-empty.tmp", ".roadgeo-notes.tmp", "a.txt", "x.tmp"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no users here")
+def test_leftovers_of_other_users_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".roadgeo-0123456789ab.tmp").mkdir()
+    monkeypatch.setattr(os, "getuid", lambda: -2)
+    write_text(tmp_path / "a.txt", "")
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_many_writers_in_one_folder(tmp_path: Path) -> None:
@@ -153,6 +163,7 @@ def test_the_old_file_stands_until_the_new_one_is_whole(tmp_path: Path) -> None:
         with replacing(path) as temporary:
             temporary.write_text("half")
             assert temporary.suffix == ".json"
+            assert os.name == "nt" or temporary.parent.stat().st_mode & 0o777 == 0o700
             assert path.read_text() == "old"
             raise KeyboardInterrupt
 
@@ -183,6 +194,7 @@ def test_planted_links_are_not_followed(tmp_path: Path, monkeypatch: pytest.Monk
     files._remove_leftovers_once.cache_clear()
     write_text(folder / "b.json", "")
     assert victim.read_text() == "precious"
+    assert (folder / f".roadgeo-{'11' * 6}.tmp" / "lock").is_symlink()
     assert (folder / "a.json").read_text() == "{}"
     assert not (folder / "a.json").is_symlink()
 

@@ -62,8 +62,8 @@ def test_photographs_too(porto: Path, tmp_path: Path) -> None:
     for path, part in zip(photos, (whole[:608, :768], whole[-608:, -768:], whole[:608, :768]), strict=True):
         cv2.imwrite(str(path), part)
     hints = ("--gsd", "0.9:1.1")
-    once = answers(porto, tmp_path / "a", photos, *hints)
-    left, right, again = (once[str(path)] for path in photos)
-    assert left == {**again, "query": left["query"]} != {**right, "query": left["query"]}
+    once = answers(porto, tmp_path / "a", photos[:2], *hints)
+    left, right = (once[str(path)] for path in photos[:2])
     assert left["n_intersections"] > 10
-    assert answers(porto, tmp_path / "b", photos[::-1], *hints, "--jobs", "2", threads=3) == once
+    again = answers(porto, tmp_path / "b", photos[:0:-1], *hints, "--jobs", "2", threads=3)
+    assert again == {str(photos[2]): {**left, "query": str(photos[2])}, str(photos[1]): right}
