@@ -229,8 +229,7 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
     box = _Box(columns.start * scale, rows.start * scale, columns.stop * scale, rows.stop * scale)
     _report_margins(name, box, (width, height))
     exact, sample, valid = (values[rows, columns] for values in (exact, sample, valid))
-    fills = _find_fills(name, exact, valid)
-    shown = valid & ~np.any([(exact == fill).all(axis=2) for fill in fills], axis=0) if fills else valid
+    fills, shown = _find_fills(name, exact, valid)
     observed = sample[shown].astype(np.float64)
     low, high = np.percentile(observed, [1, 99])
     is_8_bit = dataset.dtypes[bands[0] - 1] == "uint8"
@@ -274,12 +273,14 @@ def _report_margins(name: str, box: _Box, size: tuple[int, int]) -> None:
         _LOG.warning("%s: plain margins are not observed: %s", visible(name), listed)
 
 
-def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> list[AnyArray]:
-    """Return the (B,) colours that (H, W, B) values have in patches: the least, the greatest, a corner's.
+def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> tuple[list[AnyArray], BoolArray]:
+    """Return the (B,) colours that (H, W, B) values have in patches, and where the picture is: apart from their edges.
 
-    Patches are large, but where the colour lies far from all others, or in several corners.
+    It may be the least, the greatest, or a corner's. Patches are large, but where the colour lies far from all others,
+    or in several corners.
     """
-    seen, fills = values[valid], []
+    seen, shown = values[valid], valid
+    fills: list[AnyArray] = []
     corners = values[[0, 0, -1, -1], [0, -1, 0, -1]]
     for fill in np.unique([np.full_like(seen[0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
         rest = seen[(seen != fill).any(axis=1)].astype(np.float64)
@@ -290,9 +291,11 @@ def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> list[AnyArray]
         is_fill = find_voids((values == fill).all(axis=2) & valid, least=_FILL_AREA_PX if is_sure else None)
         if is_fill.any() and (valid & ~is_fill).sum() >= _SHOWN_SHARE * valid.sum():
             fills.append(fill)
-            shown = ", ".join(f"{value:g}" for value in np.unique(fill))
-            _LOG.warning("%s: areas of the value %s are taken for not observed", visible(name), shown)
-    return fills
+            edges = cv2.dilate(is_fill.view(np.uint8), np.ones((_VOID_CORE_PX, _VOID_CORE_PX), np.uint8)) > 0
+            shown = shown & ~edges & (values != fill).any(axis=2)
+            listed = ", ".join(f"{value:g}" for value in np.unique(fill))
+            _LOG.warning("%s: areas of the value %s are taken for not observed", visible(name), listed)
+    return fills, shown if shown.any() else valid
 
 
 def _patches_of(fill: AnyArray, values: AnyArray) -> BoolArray:
