@@ -45,6 +45,7 @@ _LOG = logging.getLogger(__name__)
 _USUAL_RATE = 25.0
 _LONG_S = 3600.0  # no flight is filmed with a gap of this length: another clock begins
 _HEAD_BYTES = 4096
+_WHOLE_SHARE = 0.95  # of the frames that a container states: some only estimate their number
 
 
 @dataclass(frozen=True)
@@ -259,6 +260,9 @@ def _video(
         yield _FrameFile(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, aspect, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
+    stated = video.get(cv2.CAP_PROP_FRAME_COUNT)
+    if k < _WHOLE_SHARE * stated:
+        _LOG.warning("%s: ends after %d of the %d frames that it states: it may be cut off", name, k, stated)
     return begun_s + at_s + step_s
 
 

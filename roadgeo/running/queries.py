@@ -27,7 +27,7 @@ from roadgeo.sources.drawn_roads import draw_roads
 from roadgeo.sources.georeference import read_pixel_shape, read_stated_middle
 from roadgeo.sources.masks import MaskSource, is_photograph, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
-from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS
+from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS, TABLE_ENDINGS
 from roadgeo.workflows import locate
 
 __all__ = ["QueryRoads", "locate_query", "read_roads"]
@@ -107,7 +107,7 @@ def open_query(path: str | AnyArray, reading: ReadOptions) -> Iterator[OpenQuery
     MaskError
         It cannot be read, or is a photograph where only masks are asked for.
     """
-    if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
+    if isinstance(path, str) and path.lower().endswith((*QUERY_ENDINGS, *TABLE_ENDINGS)):
         yield OpenQuery(path, "lines", mirrored=bool(reading.mirror))
         return
     by_values = reading.may_be_mask and not (_is_chosen_by_values(reading) and is_photograph(path))

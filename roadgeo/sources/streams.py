@@ -24,12 +24,23 @@ from roadgeo.storage.geopackage import layer_names
 from roadgeo.storage.unpacking import PACKED, unpack
 from roadgeo.storage.vectors import first_line, require_file
 
-__all__ = ["EXCHANGED", "QUERY_ENDINGS", "list_sources", "read_lines", "reading", "stream_lines", "tell_source"]
+__all__ = [
+    "EXCHANGED",
+    "QUERY_ENDINGS",
+    "TABLE_ENDINGS",
+    "list_sources",
+    "read_lines",
+    "reading",
+    "stream_lines",
+    "tell_source",
+]
 
 _LOG = logging.getLogger(__name__)
 
 #: Files that hold lines, not pixels, by their names.
 QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
+#: Files that may hold lines, but hardly do where nobody says so.
+TABLE_ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
 
 #: Files that lie beside road files, or describe them.
 _BESIDE = re.compile(

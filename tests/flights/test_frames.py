@@ -200,6 +200,16 @@ def test_times_of_a_video_go_on_and_no_frame_is_lost(
     assert message in caplog.text
 
 
+@pytest.mark.parametrize(("stated", "is_cut"), [(0, False), (12, False), (12.5, False), (20, True), (-9e15, False)])
+def test_a_video_that_ends_too_early_is_mentioned(
+    stated: float, is_cut: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Recording([0.5 * k for k in range(12)], frame_count=stated))
+    (tmp_path / "a.avi").touch()
+    assert len(list(read_frames([str(tmp_path / "a.avi")], FrameOptions(every_s=0.0)))) == 12
+    assert ("ends after 12 of the 20 frames" in caplog.text) == is_cut
+
+
 STRETCHED = [
     ({"sar_num": 4.0, "sar_den": 3.0}, (64, 85)),
     ({"sar_num": 8.0, "sar_den": 9.0}, (72, 64)),

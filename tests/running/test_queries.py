@@ -51,6 +51,12 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.parametrize("name", ["a.gpkg", "a.zip", "a.geojson.gz", "a.csv", "A.TSV", "a.csv.gz"])
+def test_lines_are_known_by_their_names(name: str) -> None:
+    with queries.open_query(name, ReadOptions()) as query:
+        assert query.kind == "lines"
+
+
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:
     assert main(["locate", *arguments, "--json", "--quiet"]) in (0, 3)
     return json.loads(capsys.readouterr().out)

@@ -2,6 +2,7 @@
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from worlds.fenway import streets, write_streets, write_vector
@@ -53,14 +54,18 @@ ANY_CRS = [
 
 
 @pytest.mark.filterwarnings("ignore:You will likely lose")
-@pytest.mark.parametrize("container", ["gpkg", "shp", "fgb", "parquet", "geojson"])
+@pytest.mark.parametrize("container", ["gpkg", "shp", "fgb", "parquet", "geojson", "csv"])
 @pytest.mark.parametrize("crs", ANY_CRS)
 def test_lines_in_any_crs_are_true_to_scale(tmp_path, crs, container):
-    if container in ("geojson", "fgb") and not crs.startswith("EPSG"):
+    if container in ("geojson", "fgb", "csv") and not crs.startswith("EPSG"):
         pytest.skip("has no name for it")
     table = gpd.GeoDataFrame(geometry=streets()[0], crs="EPSG:4326").to_crs(crs)
     path = tmp_path / f"a.{container}"
-    table.to_parquet(path) if container == "parquet" else table.to_file(path, engine="pyogrio")
+    if container == "csv":
+        texts = [f"SRID={crs[5:]};{text}" for text in shapely.to_wkt(table.geometry.to_numpy(), rounding_precision=-1)]
+        pd.DataFrame({"geometry": texts}).to_csv(path)
+    else:
+        table.to_parquet(path) if container == "parquet" else table.to_file(path, engine="pyogrio")
     drawing = draw_roads(path)
     right = gpd.GeoSeries(streets()[0], crs="EPSG:4326").to_crs("EPSG:32619").total_bounds
     size = np.array(drawing.mask.shape[::-1]) - 48
