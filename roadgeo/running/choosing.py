@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError, NotLocatedError
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.georeference import fit_place
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.placement import Placement
-from roadgeo.geometry.projection import metres_apart
+from roadgeo.geometry.projection import choose_plane, from_lonlat, metres_apart
 from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.hints import Taken
 from roadgeo.matching.index import ReferenceIndex
@@ -24,7 +29,10 @@ from roadgeo.running.probability_files import is_ours
 from roadgeo.running.queries import read_roads
 from roadgeo.running.variants import resampled
 
-__all__ = ["take_again", "take_place"]
+__all__ = ["place_by_points", "take_again", "take_place"]
+
+#: Points that spread less across than this share of what they spread along say nothing of one direction.
+_LINE = 0.03
 
 
 def take_place(location: Location, taken: Taken, options: LocateOptions | None = None) -> Location:
@@ -57,6 +65,52 @@ def take_place(location: Location, taken: Taken, options: LocateOptions | None =
         places=(chosen, *others),
         reference=chosen.reference,
         attribution=chosen.attribution,
+    )
+
+
+def place_by_points(location: Location, points: FloatArray, references: Sequence[AnyReference]) -> Location:
+    """Return an answer with its image where points put it: by an affine map if three, else by a homography.
+
+    Parameters
+    ----------
+    points : (N, 4) float64
+        Column, row, longitude and latitude of three or more.
+
+    Raises
+    ------
+    MaskError
+        They lie on a line, or no camera above the ground saw them so.
+    """
+    size = location.size or (1, 1)
+    pixels, lonlat = points[:, :2], points[:, 2:]
+    plane = choose_plane(lonlat)
+    xy = from_lonlat(plane, lonlat)
+    for side in (pixels, xy):
+        along, across = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
+        if across < _LINE * along or along == 0.0:
+            raise MaskError("the points lie on a line; give some all over the picture")
+    matrix = Homography(fit_place(pixels, xy, projective=len(points) > 3)).facing(Frame(*size).center)
+    corners = matrix.everywhere(Frame(*size).corners)
+    east, north = (np.roll(corners, -1, axis=0) - corners).T
+    if not (matrix.ahead(Frame(*size).corners).all() and np.all(east * np.roll(north, -1) < north * np.roll(east, -1))):
+        raise MaskError("no camera above the ground sees the points so; has one been exchanged for another?")
+    off_m = float(np.sqrt(np.mean(np.sum((matrix.everywhere(pixels) - xy) ** 2, axis=1))))
+    lon, lat = lonlat.mean(axis=0).tolist()
+    index = min(
+        (index for reference in references for index in reference.indexes_at([(lon, lat)])),
+        key=lambda index: float(np.hypot(*(from_lonlat(index.plane, lonlat[:1])[0] - index.xy.mean(axis=0)))),
+        default=None,
+    )
+    name, owed = ("", "") if index is None else (index.name, str(index.meta.get("attribution") or ""))
+    place = Placement(size, plane, matrix.matrix, math.nan, name, owed, is_pinhole=len(points) > 3)
+    return replace(
+        location,
+        status="chosen",
+        reason=f"placed by {len(points)} points, as given; they are off by {off_m:.1f} m (root mean square)",
+        reason_code=Reason.CHOSEN,
+        places=(place,),
+        reference=name,
+        attribution=owed,
     )
 
 

@@ -27,7 +27,7 @@ from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, problem
 from roadgeo.serving.jobs import Job, Jobs
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.page import page_file, page_text, policy_of
-from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
+from roadgeo.serving.requests import LIMIT, OF_ANSWERS, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.serving.view import KEPT, OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
 from roadgeo.serving.workers import ImageRequest, ImageWorkers, Reply
@@ -120,7 +120,7 @@ class Service:
         if not old.path.is_file():
             raise HTTPException(404, "its image is not kept: send it again")
         with self._jobs.room() as folder:
-            await asyncio.to_thread(_copy, old, folder, "take" in hints)
+            await asyncio.to_thread(_copy, old, folder, not hints.keys().isdisjoint(OF_ANSWERS))
             return self._start(Job(folder, old.image, old.name, hints), came, f"../{folder.name}")
 
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Reply:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 from urllib.parse import parse_qsl
 
 from starlette.exceptions import HTTPException
 
-from roadgeo.matching.hints import HINTS, read_taken
+from roadgeo.matching.hints import HINTS, read_numbers, read_taken
 
-__all__ = ["LIMIT", "ending_of", "read_hints", "read_query_string"]
+__all__ = ["LIMIT", "OF_ANSWERS", "ending_of", "read_hints", "read_query_string"]
 
 #: First bytes of the files that are read. Files that refer to others, as a VRT does, are not among them.
 _MAGIC = {
@@ -29,10 +29,23 @@ _MAGIC = {
 #: Hints by their names over HTTP, and the most letters of a value.
 _NAMES = {hint.parameter: hint for hint in HINTS.values()}
 _MOST_LETTERS = 200
-#: Name of the place that is taken of those that an answer lists.
-_TAKE = "take"
+#: Most points by which an image is placed; each has column, row, longitude and latitude.
+_MOST_POINTS, _LARGEST = 5, (1e6, 1e6, 180.0, 90.0)
 #: Under this name a time limit stands among the hints.
 LIMIT = HINTS["time_limit"].goes_to
+
+
+def _read_points(text: str) -> tuple[tuple[float, ...], ...]:
+    form = "COLUMN,ROW,LON,LAT of three to five points"
+    numbers = read_numbers(text, form, range(12, 4 * _MOST_POINTS + 1, 4), ",")
+    points = tuple(numbers[k : k + 4] for k in range(0, len(numbers), 4))
+    if any(abs(value) > most for point in points for value, most in zip(point, _LARGEST, strict=True)):
+        raise ValueError(f"got {text!r}, expected {form}")
+    return points
+
+
+#: What is done with an answer: one of its places is taken, or points place its image; by their names.
+OF_ANSWERS: dict[str, Callable[[str], Any]] = {"take": read_taken, "points": _read_points}
 
 
 def ending_of(head: bytes) -> str:
@@ -75,11 +88,12 @@ def read_hints(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """
     hints: dict[str, Any] = {}
     for name, value in values:
-        if name not in _NAMES and name != _TAKE:
-            raise HTTPException(400, f"got {str(name)[:40]!r}, expected one of {', '.join([*_NAMES, _TAKE])}")
+        if name not in _NAMES and name not in OF_ANSWERS:
+            raise HTTPException(400, f"got {str(name)[:40]!r}, expected one of {', '.join([*_NAMES, *OF_ANSWERS])}")
         if isinstance(value, str) and len(value) > _MOST_LETTERS:
             raise HTTPException(400, f"{name}: a text of {len(value)} characters, expected at most {_MOST_LETTERS}")
-        goes_to, read = (_TAKE, read_taken) if name == _TAKE else (_NAMES[name].goes_to, _NAMES[name].read)
+        own = OF_ANSWERS.get(name)
+        goes_to, read = (name, own) if own else (_NAMES[name].goes_to, _NAMES[name].read)
         if goes_to in hints:
             raise HTTPException(400, f"{name} is given twice: give it once")
         try:

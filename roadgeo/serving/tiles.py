@@ -23,7 +23,7 @@ from roadgeo.storage.vectors import read_layer
 if TYPE_CHECKING:
     from shapely import STRtree
 
-__all__ = ["MAX_ZOOM", "Tiles"]
+__all__ = ["MAX_ZOOM", "Tiles", "street_at"]
 
 #: Beyond this zoom maps enlarge its tiles: a pixel is then 0.6 m at the equator.
 MAX_ZOOM = 15
@@ -33,6 +33,8 @@ _WORLD_M = 2 * 20037508.342789244
 _MOST_SHARDS, _MOST_SEGMENTS = 16, 60_000
 #: Streets of a map whose names are shown.
 _MOST_STREETS = 200_000
+#: A street farther from a place lends it no name, metres of web maps.
+_NAMED_WITHIN_M = 500.0
 #: Steps of a tile's side to which its roads are laid where it shows more than a town.
 _COARSE = 512
 
@@ -146,6 +148,18 @@ def _named(path: str, box: FloatArray) -> list[tuple[FloatArray, str]]:
     parts, owner = shapely.get_parts(lines, return_index=True)
     pairs = zip(parts, names[inside][owner], strict=True)
     return [(shapely.get_coordinates(line), str(name)) for line, name in pairs if not shapely.is_empty(line)]
+
+
+def street_at(indexes: Sequence[ReferenceIndex], lonlat: tuple[float, float]) -> str:
+    """Return the name of the street of some maps that is nearest to a place; "" where none is near."""
+    import shapely
+
+    spot = shapely.Point(transform("EPSG:4326", "EPSG:3857", np.array([lonlat]))[0])
+    for tree, names in (_streets(index.path) for index in indexes):
+        nearest = tree.query_nearest(spot, max_distance=_NAMED_WITHIN_M, all_matches=False)
+        if len(nearest):
+            return str(names[nearest[0]])
+    return ""
 
 
 @lru_cache(maxsize=_MOST_SHARDS)

@@ -20,6 +20,7 @@ from roadgeo.errors import MaskError, OutputError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.drawing.raster import encode
@@ -32,6 +33,7 @@ from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY,
 from roadgeo.outputs.subject import Subject, ViewLimits
 from roadgeo.reference.opening import AnyReference
 from roadgeo.running.passes import Sighting
+from roadgeo.serving.tiles import street_at
 from roadgeo.storage.files import replacing
 
 __all__ = [
@@ -87,6 +89,7 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     (folder / PICTURE).write_bytes(encode(picture, Path(PICTURE).suffix, cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
     view: dict[str, Any] = {"size": shown.mask_size, "roads": [], "place": None}
     view["is_photograph"] = sighting.of_photograph
+    view["streets"] = [] if location.on_map else [_street(place, references) for place in location.places]
     with suppress(MaskError):  # there is not a road in it
         view["roads"] = [_rounded(line, 1) for line in shown.lines]
         view["place"] = _show_place(folder, shown) if shown.has_place else None
@@ -95,6 +98,13 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     (folder / VIEW).write_text(json.dumps(view, allow_nan=False), encoding="utf-8")
     with gzip.open(folder / KEPT, "wb", compresslevel=1) as file:
         pickle.dump(replace(sighting, explanation=None, probability=None), file)
+
+
+def _street(place: Placement, references: Sequence[AnyReference]) -> str:
+    """Name the street at the middle of a place."""
+    lonlat = place.center.lon, place.center.lat
+    maps = (reference for reference in references if reference.name == place.reference)
+    return street_at([index for reference in maps for index in reference.indexes_at([lonlat])], lonlat)
 
 
 def read_sighting(path: Path) -> Sighting | None:

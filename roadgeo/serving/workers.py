@@ -212,8 +212,10 @@ def _reply(request: ImageRequest, references: Sequence[Any], say: Say = say_noth
 
 
 def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads: int) -> Reply:
+    import numpy as np
+
     from roadgeo.matching.hints import apply_hints, asked_of_camera
-    from roadgeo.running.choosing import take_place
+    from roadgeo.running.choosing import place_by_points, take_place
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.queries import locate_query
     from roadgeo.serving.view import OWN, SEEN, read_sighting, write_view
@@ -234,19 +236,23 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
         return Reply(413, {"detail": detail})
     hints = {**request.hints, "time_limit_s": request.time_limit_s}
     hints.update(read_stated(asked_of_camera(hints), request.path))
-    taken, options = hints.pop("take", None), apply_hints(LocateOptions(), hints)
+    taken, points = hints.pop("take", None), hints.pop("points", None)
+    options = apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     kept = Path(request.path).parent.with_name(OWN) / SEEN
     has_probability = kept.is_file() and not request.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
     image, query = str(kept) if has_probability else request.path, ReadOptions(threads=threads)
-    sighting = None if taken is None else read_sighting(Path(request.path))  # of the answer whose place is taken
+    # Of an answer whose place is taken, or whose image is placed by points.
+    sighting = None if taken is None and points is None else read_sighting(Path(request.path))
     if sighting is None:
         sighting = locate_query(image, references, options, query, how=search, say=tell)
         sighting = replace(sighting, of_photograph=sighting.of_photograph or has_probability)
     if taken is not None:
         sighting = sighting.answering(take_place(sighting.location, taken, options))
+    if points is not None:
+        sighting = sighting.answering(place_by_points(sighting.location, np.array(points), references))
     location = replace(sighting.location, query=request.name)
     location = replace(location, reason=_without(request.path, _without(str(kept), location.reason)))
     lacks_view = False

@@ -299,6 +299,8 @@ def test_points_tell_where_it_is_how_large_a_pixel_and_where_up_is(page, served,
         click_on_picture(page, pixels[k])
         expect(page.locator("#asks")).to_contain_text("on the map")
         page.mouse.click(*on_map(page, places[k]))
+    expect(page.locator("#asks")).to_contain_text("A third crossing")
+    page.click("#again")
     wait_for(page, "Located")
     hints = workers.asked[-1].hints
     assert hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
@@ -306,17 +308,20 @@ def test_points_tell_where_it_is_how_large_a_pixel_and_where_up_is(page, served,
     assert turn(hints["heading_deg"][0], place.rotation_deg) < 1.0
     assert hints["heading_deg"][1] == 15.0
     expect(page.locator("#map .pin.mapped")).to_have_count(2)
-    # A third makes it surer.
+    # Three place it as they are.
     page.click("#help summary")
+    expect(page.locator("#put")).to_be_hidden()
     page.click("#pick")
     look_at(page, lonlat)
     click_on_picture(page, pixels[2])
     page.mouse.click(*on_map(page, places[2]))
     expect(page.locator("#map .pin.mapped")).to_have_count(3)
-    wait_for(page, "Located")
+    page.click("#put")
+    wait_for(page, "Chosen by you")
     assert len(workers.asked) == searches + 2
-    assert turn(workers.asked[-1].hints["heading_deg"][0], place.rotation_deg) < 1.0
-    assert workers.asked[-1].hints["heading_deg"][1] == 10.0
+    assert len(workers.asked[-1].hints["points"]) == 3
+    expect(page.locator("#reason")).to_contain_text("Placed by 3 points, as given")
+    expect(page.locator("#facts")).not_to_contain_text("crossings matched")
 
 
 def turn(a, b):
@@ -394,6 +399,8 @@ def test_points_are_chosen_by_keys(page, served, hard):
         look_at(page, to_lonlat(place.crs, place.pixel_to_map(np.array([pixel])))[0], 17)
         page.focus("#take-middle")
         page.keyboard.press("Enter")
+    page.focus("#again")
+    page.keyboard.press("Enter")
     wait_for(page, "Located")
     assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
 

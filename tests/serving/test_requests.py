@@ -41,9 +41,15 @@ def test_hints_come_from_the_url():
     assert read_query_string("") == {}
 
 
+def test_points_have_column_row_longitude_and_latitude():
+    points = read_query_string("points=1,2,8.5,47,30,2,8.6,47,1,40,8.5,47.1")["points"]
+    assert points == ((1.0, 2.0, 8.5, 47.0), (30.0, 2.0, 8.6, 47.0), (1.0, 40.0, 8.5, 47.1))
+
+
 @pytest.mark.parametrize(
     "text",
-    ["near=1,2", "near=200,0,5", "within=1,2,3", "within=1,3,2,3",
+    ["points=1,2,8.5,47,30,2,8.6,47", "points=1,2,8.5,97,30,2,8.6,47,1,40,8.5,47.1",
+     "near=1,2", "near=200,0,5", "within=1,2,3", "within=1,3,2,3",
      "gsd=2,1", "gsd=nan,1", "maxTilt=x", "maxTilt=inf", "colour=red", "a;b", "near",
      "&".join(f"a{k}=1" for k in range(50))],
 )  # fmt: skip

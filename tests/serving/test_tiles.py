@@ -11,7 +11,7 @@ from mapbox_vector_tile import decode
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
-from roadgeo.serving.tiles import MAX_ZOOM, Tiles
+from roadgeo.serving.tiles import MAX_ZOOM, Tiles, street_at
 
 WORLD_M = 2 * 20037508.342789244
 
@@ -79,6 +79,10 @@ def test_near_by_streets_have_names(town, tmp_path):
     place = to_lonlat("EPSG:3857", np.array(feature["geometry"]["coordinates"]) / 4096 * side * (1, -1) + corner)
     assert (place >= known.min(axis=0) - 1e-4).all()
     assert (place <= known.max(axis=0) + 1e-4).all()
+    # The nearest one lends a place its name.
+    there = known.mean(axis=0) if len(known) == 2 else known[len(known) // 2]
+    assert street_at([reference.index], tuple(there.tolist())) == f"Street {number}"
+    assert street_at([reference.index], (lon + 1.0, lat)) == ""
     assert "streets" not in decode(Tiles([reference]).tile(0, 14, column // 2, row // 2))
 
 

@@ -54,7 +54,7 @@ export function makeMap({ references, basemap, basemap_attribution, max_zoom }) 
           { id: "area", type: "fill", source: "area", paint: { "fill-color": "#1a5fa5", "fill-opacity": 0.12 } },
           { id: "area-edge", type: "line", source: "area", paint: { "line-color": "#1a5fa5", "line-width": 2, "line-dasharray": [2, 1] } },
           { id: "outline-case", type: "line", source: "outline", paint: { "line-color": "#ffffff", "line-width": 6 } },
-          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } },
+          { id: "outline", type: "line", source: "outline", paint: { "line-color": ["case", ["boolean", ["get", "chosen"], false], "#e4572e", "#1a5fa5"], "line-width": 3 } },
           { id: "seen-case", type: "line", source: "roads", paint: { "line-color": "#ffffff", "line-width": 5, "line-opacity": 0.75 } },
           { id: "seen", type: "line", source: "roads", paint: { "line-color": "#e4572e", "line-width": 2.4 } },
           { id: "matches", type: "line", source: "matches", layout: hidden, paint: { "line-color": "#6a1b9a", "line-width": 3 } },
@@ -105,6 +105,7 @@ export async function showAnswer(base, view, found) {
   clearMarkers();
   if (map.getLayer("photo")) map.removeLayer("photo");
   if (map.getSource("photo")) map.removeSource("photo");
+  refused = [];
   const place = view?.place, matches = place?.matches ?? [];
   set("outline", place ? [feature("LineString", place.outline)] : []);
   set("roads", place ? [feature("MultiLineString", place.roads)] : []);
@@ -126,11 +127,21 @@ export async function showAnswer(base, view, found) {
 export const boxOf = (corners) => corners.reduce((all, corner) => all.extend(corner), new maplibre.LngLatBounds());
 const onMap = (places, reference) => (places ?? []).filter((one) => one.reference === reference);
 
+let refused = [];
+const outline = (chosen) => set("outline", refused.map((place) => feature("LineString", [...place.footprint_lonlat, place.footprint_lonlat[0]], { chosen: place === chosen })));
+
+/** Look at one of the places of an answer. */
+export function lookAt(place) {
+  if (refused.includes(place)) outline(place);
+  fit(boxOf(place.footprint_lonlat ?? [[place.center.lon, place.center.lat]]));
+}
+
 /** Outline the best places of a refusal, and look at those on the map of the first. */
 function showRefused(found) {
   const places = (found?.alternatives ?? []).filter((one) => one.footprint_lonlat);
   if (!places.length) return;
-  set("outline", places.map(({ footprint_lonlat: ring }) => feature("LineString", [...ring, ring[0]])));
+  refused = places;
+  outline();
   fit(boxOf(onMap(places, places[0].reference).flatMap((one) => one.footprint_lonlat)));
 }
 
@@ -138,9 +149,12 @@ function set(source, features) {
   map.getSource(source).setData(collection(features));
 }
 
-/** Show all of a box, such as the bounds of a reference. */
+/** Show all of a box, such as the bounds of a reference; at once where nothing of it is in view. */
 export function fit(box) {
-  map.fitBounds(box, { padding: padding(), maxZoom: 18, duration: matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 700 });
+  const there = maplibre.LngLatBounds.convert(box), here = map.getBounds();
+  const apart = there.getWest() > here.getEast() || there.getEast() < here.getWest() || there.getSouth() > here.getNorth() || there.getNorth() < here.getSouth();
+  const still = apart || matchMedia("(prefers-reduced-motion: reduce)").matches;
+  map.fitBounds(there, { padding: padding(), maxZoom: 18, duration: still ? 0 : 700 });
 }
 
 let opacity = 0.85;

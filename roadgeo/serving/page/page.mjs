@@ -1,6 +1,6 @@
 // The page: takes pictures, shows how far they are and where they lie, and asks for help where they were refused.
 import * as view from "./map.mjs";
-import { hintsOf } from "./points.mjs";
+import { hintsOf, written } from "./points.mjs";
 
 const $ = (id) => document.getElementById(id);
 const WORDS = { located: "Located", ambiguous: "Two places", chosen: "Chosen by you", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
@@ -185,15 +185,20 @@ function show(entry) {
   $("files-of").hidden = !over || !found;
   $("files-of").open = false;
   if (hasMap) {
-    const map = maps.findIndex(({ name }) => name === found?.reference);
-    if (map >= 0) $("maps").selectedIndex = map;
+    nameMap(found?.alternatives[0] && !sure ? found.alternatives[0].reference : found?.reference);
     view.showAnswer(entry.base, seen, found).then(() => entry === current && showPlaces(entry));
-    view.showArea(sure ? null : entry.hints.near);
+    view.showArea(sure || entry.hints.near === STATED ? null : entry.hints.near);
   }
   const refused = hasMap && status === "not_located" && found?.alternatives.length > 0;
   $("places").hidden = !refused && (status !== "ambiguous" || !placed);
   $("places").querySelector("p").textContent = refused ? "None is sure enough. If you know one to be right, take it:" : "Which one is it?";
   if (sure) showFiles(entry);
+}
+
+/** Have the list of maps say which one is looked at. */
+function nameMap(wanted) {
+  const map = maps.findIndex(({ name }) => name === wanted);
+  if (map >= 0) $("maps").selectedIndex = map;
 }
 
 function showProgress(entry) {
@@ -250,7 +255,7 @@ function facts(found, matches) {
   if (found.tilt_deg > 2) rows.push(["Tilt", `${found.tilt_deg.toFixed(0)}°`]);
   if (found.corner_sigma_m) rows.push(["Corners", `± ${length(Math.max(...found.corner_sigma_m))} (standard deviation, at worst)`]);
   if (found.camera) rows.push(["Camera", `${length(found.camera.height_m)} above the ground`]);
-  rows.push(["Roads", `${found.n_matched} of ${found.n_intersections} crossings matched`]);
+  if (found.n_matched) rows.push(["Roads", `${found.n_matched} of ${found.n_intersections} crossings matched`]);
   if (matches.length) {  // the largest come first
     rows.push(["Residuals", `median ${length(matches[matches.length >> 1].residual_m)}, largest ${length(matches[0].residual_m)}`]);
   }
@@ -274,16 +279,20 @@ async function showFiles(entry) {
 function showPlaces(entry) {
   const { status, document: found } = entry;
   const take = (i) => again(entry, { ...entry.hints, take: i + 1 });
-  if (status === "not_located") offer(found?.alternatives ?? [], "Take it", take);
-  if (status === "ambiguous") offer([found, ...found.alternatives].slice(0, 6), "It is this one", take);
+  if (status === "not_located") offer(entry, found?.alternatives ?? [], "Take it", take);
+  if (status === "ambiguous") offer(entry, [found, ...found.alternatives].slice(0, 6), "It is this one", take);
 }
 
 /** Show places by letters, on the map and in a list: one button goes there, another takes it. */
-function offer(places, words, take) {
+function offer(entry, places, words, take) {
   $("places").querySelector("ol").replaceChildren(...places.map((place, i) => {
-    const letter = "ABCDEF"[i], { lon, lat } = place.center, go = () => view.fit(view.boxOf(place.footprint_lonlat ?? [[lon, lat]]));
+    const letter = "ABCDEF"[i], { lon, lat } = place.center;
+    const go = () => {
+      view.lookAt(place);
+      nameMap(place.reference);
+    };
     view.addMarker([lon, lat], letter, `Place ${letter}: look at it`, "place").getElement().addEventListener("click", go);
-    const where = [place.reference, degrees(place.center), place.log10_odds === null ? "" : `score ${place.log10_odds.toFixed(1)}`];
+    const where = [place.reference, entry.view?.streets?.[i], degrees(place.center), place.log10_odds === null ? "" : `score ${place.log10_odds.toFixed(1)}`];
     const there = make("button", { type: "button", onclick: go, title: "Look at it on the map" },
       make("b", { textContent: letter }), make("span", { textContent: where.filter(Boolean).join(", ") }));
     const taken = make("button", { type: "button", className: "take", onclick: () => take(i), textContent: words });
@@ -310,9 +319,12 @@ function complain(text) {
 
 // --- helping ----------------------------------------------------------------------------------------------------------
 
+const MOST_POINTS = 5;
 let pairs = [], waiting = null, picking = false;  // { pixel, lonlat }; a pixel that waits for its place
 
-const STATED = "exif", STATABLE = ["near", "gsd", "heading"];  // hints that a camera may state
+// Hints that a camera may state, and the fields in which they are typed instead.
+const STATED = "exif", TYPED = { near: ["near-lat", "near-lon", "near-km"], gsd: ["gsd-low", "gsd-high", "height", "lens"], heading: ["heading", "heading-off"] };
+const STATABLE = Object.keys(TYPED);
 
 function resetHelp(entry) {
   const given = Object.entries(entry.hints).filter(([, value]) => value !== STATED);
@@ -334,7 +346,8 @@ function resetHelp(entry) {
 
 const round = (value) => Number(value.toPrecision(6));
 function setNear(near) {
-  [["near-lon", near?.[0]], ["near-lat", near?.[1]], ["near-km", near && near[2] / 1000]].forEach(([id, value]) => { $(id).value = value === undefined ? "" : Number(value.toPrecision(8)); });
+  const [lon, lat, m] = near ?? [];
+  [["near-lon", lon?.toFixed(6)], ["near-lat", lat?.toFixed(6)], ["near-km", m && (m / 1000).toPrecision(3)]].forEach(([id, text]) => { $(id).value = text ? Number(text) : ""; });
 }
 
 /** What is known, from the form. */
@@ -364,6 +377,12 @@ function again(entry, hints) {
   choose(next);
   scrollUp();
   return start(next, `${entry.view.of ?? entry.base}/again?${query}`, { method: "POST" });  // of a failed one nothing is kept
+}
+
+/** Have the picture placed by the points, as they are. */
+function putThere() {
+  $("hint-trouble").textContent = "";
+  return again(current, { points: written(pairs) });
 }
 
 function scrollUp() {
@@ -430,7 +449,7 @@ function pixelAt({ clientX, clientY }) {
 }
 
 function pickPixel(pixel) {
-  if (pairs.length >= 3) return;
+  if (pairs.length >= MOST_POINTS) return;
   waiting = pixel;
   showPairs();
   tell(`Now click the same crossing on the map (${pairs.length + 1})`);
@@ -445,8 +464,8 @@ function setPlace(lonlat) {
   pairs.push({ pixel: waiting, lonlat });
   waiting = null;
   showPairs();
-  tell(pairs.length < 2 ? "One more: click another crossing in the picture" : "");
-  if (pairs.length >= 2) searchAgain();
+  tell(["One more: click another crossing in the picture", "A third crossing in the picture, or “Search again” near these two"][pairs.length - 1]
+    ?? "“Put it there” places the picture by these points, as they are");
 }
 
 function showPairs() {
@@ -461,6 +480,7 @@ function showPairs() {
   }));
   $("pairs").replaceChildren(...pairs.map(({ lonlat: [lon, lat] }) => make("li", { textContent: degrees({ lat, lon }) })));
   $("unpick").hidden = !all.length;
+  $("put").hidden = pairs.length < 3;
   if (!hasMap || current.status === "ambiguous") return;
   view.clearMarkers();
   if (!all.length) showPlaces(current);
@@ -469,7 +489,8 @@ function showPairs() {
     marker.on("dragend", () => {
       const { lng, lat } = marker.getLngLat();
       pairs[i] = { ...pairs[i], lonlat: [lng, lat] };
-      if (pairs.length >= 2) searchAgain();
+      if (current.hints.points) putThere();
+      else if (pairs.length === 2) searchAgain();
     });
   });
 }
@@ -535,6 +556,12 @@ function listen() {
     pairs = [];
     setPicking(picking);
   };
+  $("put").onclick = putThere;
+  Object.entries(TYPED).forEach(([name, fields]) => {
+    const tick = $(`${name}-stated`);
+    tick.addEventListener("change", () => tick.checked && fields.forEach((id) => { $(id).value = ""; }));
+    fields.forEach((id) => $(id).addEventListener("input", () => { tick.checked = false; }));
+  });
   $("photo").onclick = (event) => picking && pickPixel(pixelAt(event));
   $("photo").onkeydown = aimByKeys;
   $("take-middle").onclick = () => waiting && setPlace(view.middle());

@@ -28,14 +28,19 @@ export function fitPoints(pairs, [width, height]) {
   return gsd > 0 ? { middle: offset(home, lay([width / 2, -height / 2])), gsd, heading: Math.atan2(-s, c) * 180 / Math.PI, off } : null;
 }
 
-/** The hints that points give; two are taken less exactly, for a tilted picture is no similarity. */
+const digits = (value, n) => Number(value.toFixed(n)), three = (value) => Number(value.toPrecision(3));
+
+/** Points as the server takes them: column, row, longitude and latitude of each. */
+export const written = (pairs) => pairs.map(({ pixel, lonlat }) => [...pixel.map((one) => digits(one, 1)), ...lonlat.map((one) => digits(one, 6))]).join(",");
+
+/** The hints that points give, rounded; two are taken less exactly, for a tilted picture is no similarity. */
 export function hintsOf(pairs, size) {
   const fit = fitPoints(pairs, size);
   if (!fit) return null;
   const diagonal = fit.gsd * Math.hypot(...size), [loose, turn] = pairs.length > 2 ? [1.25, 10] : [1.35, 15];
   return {
-    near: [...fit.middle, Math.max(0.25 * diagonal, 4 * fit.off)],
-    gsd: [fit.gsd / loose, fit.gsd * loose],
-    heading: [fit.heading, turn],
+    near: [...fit.middle.map((one) => digits(one, 6)), Math.ceil(Math.max(0.25 * diagonal, 4 * fit.off))],
+    gsd: [three(fit.gsd / loose), three(fit.gsd * loose)],
+    heading: [digits(fit.heading, 1), turn],
   };
 }
