@@ -10,6 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,16 +114,29 @@ def _stream(
     name = path.name.lower()
     if why := _ELSEWHERE.get(path.suffix.lower()) or _what_is_wrong(path):
         raise RoadSourceError(f"{path}: {why}")
+    asked = [layer] if isinstance(layer, str) else [*(layer or ())]
     if name.endswith(OSM_ENDINGS):
-        yield from stream_ways(path, most, advance, folder)
+        tables = stream_ways(path, most, advance, folder)
     elif name.endswith(_GRAPHS):
-        yield _read_graphml(path)
+        tables = iter([_read_graphml(path)])
     elif name.endswith(_PARQUET):
-        yield from _stream_parquet(path, most, advance)
+        tables = _stream_parquet(path, most, advance)
     elif name.endswith(".json") and (elements := _overpass_elements(path)) is not None:
-        yield overpass_table(elements)
+        tables = iter([overpass_table(elements)])
     else:
-        yield from _stream_gdal(path, layer, most, advance, areas=areas)
+        yield from _stream_gdal(path, asked, most, advance, areas=areas)
+        return
+    yield from tables if not asked else (_of_levels(path, table, asked) for table in tables)
+
+
+def _of_levels(path: Path, table: RoadTable, asked: Sequence[str]) -> RoadTable:
+    """Return what of a table is in layers of the drawing that it was made of."""
+    column = next((name for name in table.columns if name.lower() in _LEVELS), None)
+    if column is None:
+        raise RoadSourceError(f"{path}: has no layers: leave --layer out, or read it by itself")
+    rows = np.isin(table.columns[column].astype(str), asked)
+    columns = {name: values[rows] for name, values in table.columns.items()}
+    return replace(table, shapes=table.shapes[rows], columns=columns)
 
 
 # --- GDAL -------------------------------------------------------------------------------------------------------------
@@ -137,11 +151,11 @@ class _Part(NamedTuple):
 
 
 def _stream_gdal(
-    path: Path, layer: str | Sequence[str] | None, most: int, advance: Callable[[float], None], *, areas: bool
+    path: Path, asked: Sequence[str], most: int, advance: Callable[[float], None], *, areas: bool
 ) -> Iterator[RoadTable]:
     import shapely
 
-    parts = _choose_parts(path, [layer] if isinstance(layer, str) else [*(layer or ())], areas=areas)
+    parts = _choose_parts(path, asked, areas=areas)
     for n, (held, column, levels) in enumerate(parts):
         total, columns, hint = _choose_columns(path, held)
         part = what_is_missing(path, total)
@@ -326,6 +340,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
             names = [name for name in file.schema_arrow.names if name != shape_column]
             leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
         wanted = [name for name in names if is_known_column(name)] or names
+        wanted = [name for name in names if name in wanted or name.lower() in _LEVELS]
         text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
         done = 0
         with pq.ParquetFile(path, read_dictionary=text) as file:

@@ -70,6 +70,20 @@ def test_layers_of_a_drawing_are_chosen(tmp_path, name, asked, n):
         read_lines(path, "road")
 
 
+@pytest.mark.parametrize(("asked", "n"), [("ROAD-CL", 2), (["ROAD-CL", "LANE"], 3), (None, 5)])
+def test_layers_of_a_drawing_are_chosen_in_parquet_too(tmp_path, asked, n):
+    layers = ["ROAD-CL", "CONTOUR", "ROAD-CL", "LANE", "PARCEL"]
+    lines = [shapely.LineString([(k, 0), (k, 100)]) for k in range(5)]
+    gpd.GeoDataFrame({"Layer": layers}, geometry=lines, crs="EPSG:32629").to_parquet(tmp_path / "plan.parquet")
+    assert len(read_lines(tmp_path / "plan.parquet", asked).lines) == n
+
+
+@pytest.mark.parametrize("name", ["a.parquet", "a.osm.pbf", "a.osm.gz"])
+def test_a_layer_is_not_passed_over_where_there_are_none(tmp_path, name):
+    with pytest.raises(RoadSourceError, match="has no layers: leave --layer out"):
+        read_lines(write_streets(tmp_path / name), "roads")
+
+
 def test_layers_of_a_drawing_are_listed(tmp_path, caplog):
     with pytest.raises(RoadSourceError, match="several layers hold lines, CONTOUR, ROAD-CL: choose with --layer"):
         read_lines(drawing(tmp_path / "a.dxf", "ROAD-CL", "CONTOUR"))
