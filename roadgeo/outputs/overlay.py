@@ -75,6 +75,8 @@ def draw_overlay(subject: Subject, map_px: int = MAP_PX) -> AnyArray:
     panels = np.hstack([left, blank(height, _GAP), canvas.image])
     picture = np.vstack([blank(top, panels.shape[1]), panels, blank(top // 2, panels.shape[1])])
     baseline, size = len(picture) - round(top * 0.15), round(top * 0.22)
+    wide = draw_legend(blank(top, width), layers, 0, top // 2, size)
+    size = min(size, size * width // max(wide, 1))  # a map of a portrait is narrow
     draw_legend(picture, layers, picture.shape[1] - width, baseline, size)
     write_text(picture, subject.attribution, (_GAP, baseline), round(top * 0.2), FAINT)
     location = subject.location

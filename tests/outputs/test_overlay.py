@@ -65,6 +65,12 @@ def test_everything_is_drawn(truetype: bool, monkeypatch: pytest.MonkeyPatch) ->
         assert (picture == color).all(axis=2).sum() > 50
 
 
+def test_the_legend_of_a_portrait_ends_within_the_picture() -> None:
+    portrait = located(np.diag([0.5, 1.0, 1.0]) @ located().homography)
+    picture = draw_overlay(shown(portrait), 900)
+    assert (picture[-20:, -12:] > 240).all()
+
+
 @pytest.mark.parametrize("stretch", [(1.0, 1.0), (12.0, 1.0), (1.0, 12.0)])
 def test_a_long_footprint_still_makes_a_picture_of_bounded_size(stretch: tuple[float, float]) -> None:
     long = located(np.diag([*stretch, 1.0]) @ located().homography)

@@ -174,8 +174,8 @@ def framed(picture: AnyArray, margin: int) -> AnyArray:
     return np.pad(picture, ((margin, margin), (margin, margin), (0, 0)), constant_values=255)
 
 
-def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int, size: int) -> None:
-    """Write the labels of the layers that are shown, each with its sign, from (x, baseline) on."""
+def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int, size: int) -> int:
+    """Write the labels of the layers that are shown, each with its sign, from (x, baseline) on; return the end."""
     middle = baseline - round(size * 0.35)
     for layer in layers:
         style = STYLES.get(layer.name)
@@ -189,6 +189,7 @@ def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int,
             end = x + round(2.5 * size)
             cv2.line(image, (x + 4, middle), (end - size // 2, middle), rgb(style.color), width, cv2.LINE_AA)
         x = write_text(image, layer.label, (end, baseline), size, INK) + round(1.4 * size)
+    return x
 
 
 def draw_scale_bar(canvas: Canvas, size: int) -> None:
