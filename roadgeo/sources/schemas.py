@@ -57,10 +57,9 @@ _WORDS[_OSM_NAME] = _OSM
 _HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
 _OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHER_KEYS}
 #: Words that show that a line is a road, or none, whatever column they stand in.
+_AMBIGUOUS = {*map(_plain, _DATA["ambiguous"])}
 _CERTAIN = {
-    maker: {
-        word: kind for word, kind in words.items() if word not in {*map(_plain, _DATA["ambiguous"])} and "*" not in word
-    }
+    maker: {word: kind for word, kind in words.items() if word not in _AMBIGUOUS and "*" not in word}
     for maker, words in _WORDS.items()
 }
 _FEWEST = 2  # such words for roads, of those in a column of a general or unknown name, until all are believed
