@@ -272,6 +272,8 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
     """Name the drivers that may read a file: the one of its first bytes, or those that the user allows besides."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
+    if not head:
+        raise MaskError(f"{name}: is empty; copy or export it again")
     driver = next((driver for magic, driver in _DRIVERS if re.match(magic, head, re.DOTALL)), None)
     if driver == "VRT" and "VRT" not in more:
         raise MaskError(

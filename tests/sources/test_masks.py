@@ -449,7 +449,7 @@ def test_files_that_are_none(tmp_path: Path, roads: np.ndarray) -> None:
         ("none.png", "no such file"),
         ("", "is a folder"),
         ("text.tif", "is text, whatever its name says"),
-        ("empty.png", "not a raster"),
+        ("empty.png", "is empty"),
         ("cut.png", "damaged or cut short"),
     ):
         with pytest.raises(MaskError, match=message) as raised:

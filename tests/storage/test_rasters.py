@@ -543,3 +543,11 @@ def test_a_thumbnail_in_front_is_no_picture(
     if sizes[0] >= 64:
         with open_raster(name_page(str(path), 1)) as dataset:  # which one may ask for
             assert dataset.shape == (sizes[0],) * 2
+
+
+@pytest.mark.parametrize("read", READERS, ids=["mask", "picture", "exif"])
+@pytest.mark.parametrize("suffix", ["png", "tif", "jpg", "npy", "jp2"])
+def test_an_empty_file_is_called_so(tmp_path: Path, read, suffix: str) -> None:
+    (tmp_path / f"a.{suffix}").touch()
+    with pytest.raises(MaskError, match="is empty"):
+        read(tmp_path / f"a.{suffix}")
