@@ -241,7 +241,7 @@ def bad_mask(name: str) -> Path:
     ("name", "message"),
     [
         ("missing.png", "no such file"),
-        ("empty.png", "not a raster"),
+        ("empty.png", "is empty"),
         ("black.png", "shows no road"),
         ("photo.png", "looks like a photograph"),
     ],
