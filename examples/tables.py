@@ -2,8 +2,8 @@
 
 BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
 The bands of the score are the same as in `error_rate` of a result. The other tables count the searches that
-`examples/trust`, `examples/photographs` and `examples/peers` keep in their `results`. `--check` writes nothing, and
-fails if a table would change.
+`examples/trust`, `examples/photographs`, `examples/company` and `examples/peers` keep in their `results`. `--check`
+writes nothing, and fails if a table would change.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 EXAMPLES = Path(__file__).resolve().parent
-sys.path[:0] = [str(EXAMPLES), str(EXAMPLES / "peers"), str(EXAMPLES / "photographs")]
+sys.path[:0] = [str(EXAMPLES), *(str(EXAMPLES / name) for name in ("company", "peers", "photographs"))]
 
+import company  # noqa: E402
 import join  # noqa: E402
 import photographs  # noqa: E402
 import results  # noqa: E402
@@ -39,6 +40,7 @@ WORN = {
     "torn": "torn: 30 to 50 % gone, 10 to 40 % false",
     "outdated": "outdated: mild, 20 to 40 % of the streets unknown to the map",
 }
+COMPANY = ("shards", "told", "twice", "mirrored")
 NAMES = {
     "base": "usual: 10 % gone, 4 % false, ragged edges",
     "clean": "clean: level, nothing gone or false, smooth edges",
@@ -108,6 +110,16 @@ def photographs_table() -> Iterator[str]:
     yield from photographs.count(EXAMPLES / "photographs" / "results" / "photographs.csv").splitlines()
 
 
+def company_table() -> Iterator[str]:
+    """Make the table of masks in company: each set, each kind."""
+    for name in COMPANY:
+        head, rule, *rows = company.count(EXAMPLES / "company" / "results" / f"{name}.csv").splitlines()
+        yield from (head, rule) if name == COMPANY[0] else ()
+        for row in rows:
+            kind, rest = row.removeprefix("| ").split(" | ", 1)
+            yield f"| {name}: {NAMES.get(kind, kind).partition(':')[0]} | {rest}"
+
+
 def peers_table() -> Iterator[str]:
     """Yield the lines of the table of the authors' programs, on maps of 10 x 10 km."""
     rows = results.read(join.FOLDER / "joined.csv")
@@ -131,7 +143,8 @@ def main(arguments: list[str] | None = None) -> None:
     before = page = PAGE.read_text(encoding="utf-8")
     if options.bench:
         page = put(page, "bench", bench_table(json.loads(options.bench.read_text(encoding="utf-8"))))
-    tables = {"worn": worn_table, "photographs": photographs_table, "peers": peers_table, "trust": trust_table}
+    tables = {"worn": worn_table, "photographs": photographs_table, "company": company_table}
+    tables |= {"peers": peers_table, "trust": trust_table}
     for name, table in tables.items():
         page = put(page, name, table())
     if options.check and page != before:
