@@ -40,7 +40,7 @@ COMMANDS = {
     "locate": ("roadgeo.cli.locate", "Find where images lie on a map, and draw them there."),
     "serve": ("roadgeo.cli.serve", "A page to drop photographs on; answers over HTTP."),
     "qgis": ("roadgeo.cli.qgis", "Install the QGIS plugin."),
-    "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
+    "demo": ("roadgeo.cli.demo", "Locate a photograph and five masks: needs no network and no data."),
     "reference": ("roadgeo.cli.references", "List, describe, test and remove references."),
     "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
     "verify": ("roadgeo.cli.verify", "Say whether georeferenced images are where they claim to be."),

@@ -373,7 +373,7 @@ def _matches(subject: Subject) -> str:
     left_out = subject.location.n_matched - len(rows)
     note = f'<p class="faint">{left_out} more, with smaller residuals, are not shown.</p>' if left_out > 0 else ""
     return (
-        '<p class="faint">Choose one here or in a picture to see it in both. Arrows go from the map to the mask.</p>'
+        '<p class="faint">Choose one here or in a picture to see it in both. Arrows go from the map to the image.</p>'
         '<p class="chosen-match" role="status"></p>'
         f"<details><summary>All {len(rows)}, the largest residual first</summary>"
         f"{table(('No.', 'column', 'row', 'x', 'y', 'residual, m'), rows, 'matches')}</details>{note}"
