@@ -100,7 +100,7 @@ def desk(shelf, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_does_what_it_says(page: str, desk: Path, request: pytest.FixtureRequest) -> None:
     """Its blocks run in order in one folder, end as it says, print what it shows, and leave the files it names."""
-    if "roadgeo_demo" in PAGES[page] and "\nroadgeo demo\n" not in PAGES[page]:
+    if re.search("roadgeo[_ ]demo", PAGES[page]) and "\nroadgeo demo\n" not in PAGES[page]:
         shutil.copytree(request.getfixturevalue("demonstrated"), desk / "roadgeo_demo")
     left_out = {block.line for block in blocks(PAGES[page]) if block.text.startswith(ELSEWHERE)}
     with fake_osm() as osm:
