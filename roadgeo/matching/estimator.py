@@ -285,14 +285,14 @@ class TripleEstimator:
                 distinct.append(place)
                 yield place
 
-    def look_for_equals(self, place: Place) -> None:
+    def look_for_equals(self, place: Place, deadline: float = math.inf) -> bool:
         """Verify where else on the map a place's own tuples fit, at any turn and scale; once for each place.
 
-        They are refined to the end: an equal place that grew from few intersections explains little at first.
+        They are refined to the end: an equal place that grew from few intersections explains little at first. Returns
+        whether all were looked for before the deadline, by `time.perf_counter`.
         """
         if any(other.same(place) for other in self._equals_of):
-            return
-        self._equals_of.append(place)
+            return True
         camera, there = self.options.camera, place.matches[0]
         scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
         args = self.scene, [self.index], scale, camera.min_shape_ratio, _OWN_TUPLES
@@ -303,11 +303,15 @@ class TripleEstimator:
             elsewhere = self.allow(proposals) & ~is_own & (proposals.placed >= placed)
             kept = self.screen(proposals, elsewhere, MAX_SCREENED)
             for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
+                if time.perf_counter() > deadline:
+                    return False
                 if other.same(place):
                     continue
                 whole = self.refine_whole(self.settle(other)[0])
                 if whole.refined is not None and self.may_be(whole.matrix):
                     self.verified.append(whole)
+        self._equals_of.append(place)
+        return True
 
     def settle(self, place: Place) -> tuple[Place, float]:
         """Return a place refined, and its score: its lead over the places that were met, and over those nearby."""

@@ -181,7 +181,8 @@ class Rivals:
         place = self._by_roads(part)
         if place is None or place.score < self.needed:
             return place
-        self.estimators[part].look_for_equals(place)
+        if not self.estimators[part].look_for_equals(place, self._deadline):
+            return place.but(score=min(place.score, 0.0))
         return self._by_roads(part)
 
     def _by_roads(self, part: Search[Place]) -> Place | None:
