@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,9 +15,8 @@ import click
 from roadgeo._options import option, part, take
 from roadgeo._progress import Say
 from roadgeo._text import counted
-from roadgeo.cli.options import Engine, Plugin, Shared, Verbosity, command, installed
+from roadgeo.cli.options import Engine, Plugin, Shared, Verbosity, command, installed, make_cluster
 from roadgeo.cli.printing import echo, is_set, tell
-from roadgeo.cli.shards import build_in_shards, read_shards, tell_built
 from roadgeo.geometry.areas import Box
 from roadgeo.matching.hints import read_box, read_place
 from roadgeo.roads.kinds import RoadKind
@@ -28,6 +28,18 @@ if TYPE_CHECKING:
 __all__ = ["index_command"]
 
 SOURCE, ROADS, RESULT, PIECES = "Where the roads come from", "Which roads", "The reference", "In pieces"
+
+
+def _read_shards(text: str) -> dict[str, Any]:
+    """Read how a map is cut, as options of the build: "auto", about how many shards, or the side of square ones."""
+    if text == "auto":
+        return {}
+    if text.isdecimal() and int(text) > 0:
+        return {"count": int(text)}
+    size = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?km", text)
+    if size and 1 <= float(size[1]) <= 1000:
+        return {"size_m": 1000.0 * float(size[1])}
+    raise ValueError(f"got {text!r}, expected auto, a number, or a side such as 25km (1 to 1000)")
 
 
 # fmt: off
@@ -72,7 +84,7 @@ class Index:
     replace: bool = option("--replace", "", RESULT, "Replace a reference of that name without asking.")
     shards: dict[str, Any] | None = option("--shards", "auto|N|SIZEkm", PIECES,
         "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
-        read=read_shards)
+        read=_read_shards)
     margin: float = option("--margin", "METRES", PIECES,
         "Ground that neighbours share. Half the diagonal of the largest frame to locate.",
         limits=(0, 100_000), default=3000.0, show_default=True, rare=True)
@@ -126,7 +138,7 @@ def index_command(asked: Index) -> None:
         _require_geopackage(asked.out)
     name = asked.name or _name(asked, given)
     if asked.shards is not None:
-        build_in_shards(asked, name)
+        _build_in_shards(asked, name)
         return
     path = Path(asked.out) if asked.out else new_reference(name)
     make_folder(path.parent)  # before the long part
@@ -142,7 +154,52 @@ def index_command(asked: Index) -> None:
     if is_set("verbose"):
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)
-    tell_built(f"{path}: {counted(len(reference.index), 'intersection')}", started, asked.out or path.stem)
+    _tell_built(f"{path}: {counted(len(reference.index), 'intersection')}", started, asked.out or path.stem)
+
+
+def _build_in_shards(asked: Index, name: str) -> None:
+    """Build a reference in shards from road files, and describe the result.
+
+    Raises
+    ------
+    click.UsageError
+        The roads do not come from files, or `--out` names something else.
+    """
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import show_steps
+    from roadgeo.reference.library import make_slug, new_reference
+    from roadgeo.reference.shards import ENDING
+    from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
+    from roadgeo.storage.files import make_folder
+
+    out = asked.out
+    if not asked.roads:
+        raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")
+    # Target: a folder, in the library unless `--out` names another.
+    started = perf_counter()
+    path = Path(out) if out else new_reference(name).with_suffix(ENDING)
+    if path.suffix != ENDING:
+        if path.suffix in {".gpkg", ".index"}:
+            raise click.UsageError(f"--out {out}: with --shards that is a folder; did you mean {path.stem}{ENDING}?")
+        path = path.with_name(f"{path.name}{ENDING}")
+    make_folder(path)
+    # Sources and options.
+    which = (asked.layer, asked.crs, asked.kinds, asked.tunnels, asked.bbox, asked.attribution)
+    files = RoadFiles(tuple(map(Path, asked.roads)), *which)
+    compile_once(map_only=True)
+    with show_steps() as say:
+        options = ShardOptions(**asked.shards or {}, margin_m=asked.margin)
+        cluster = make_cluster(asked.engine, asked.scheduler, asked.jobs)
+        reference = build_shards(files, path, make_slug(name), options, jobs=asked.jobs, cluster=cluster, say=say)
+    entries = reference.manifest.filled
+    n = sum(entry.own_intersections for entry in entries)
+    _tell_built(f"{path}: {n:,} intersections in {len(entries)} shards", started, out or path.stem)
+
+
+def _tell_built(built: str, started: float, reference: str) -> None:
+    """Print what was built, since a moment of `perf_counter`, and how it is searched."""
+    seconds = perf_counter() - started
+    tell(f"{built} in {seconds:.1f} s; search it with `roadgeo locate photo.jpg -r {reference}`")
 
 
 def _kinds_of_coarse(asked: Index) -> RoadKind:
