@@ -122,18 +122,18 @@ def serve_command(asked: Serve) -> int:
     host = f"[{options.host}]" if ":" in options.host else options.host
     address = f"http://{host}:{server.server_port}/"
     names = ", ".join(item.name for item in maps)
-    echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
-    if not asked.no_browser and _has_screen():
-        threading.Timer(0.5, webbrowser.open, [address]).start()
     ended_by: list[int] = []
 
     def end(number: int, _: FrameType | None) -> None:
         ended_by.append(number)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, end)
-    _log()
     try:
+        signal.signal(signal.SIGTERM, end)
+        _log()
+        echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
+        if not asked.no_browser and _has_screen():
+            threading.Timer(0.5, webbrowser.open, [address]).start()
         server.serve_forever()
     except KeyboardInterrupt:
         pass

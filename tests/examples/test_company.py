@@ -34,6 +34,4 @@ def test_counts_of_the_kept_results_are_printed(tmp_path: Path) -> None:
         'porto,"frame512, false",0,1,not_located,0,fits_elsewhere,1.0,nan,0.50,a\n'
         'porto,"frame512, false",1,1,located,0,located,4.0,nan,0.25,a\n'
     )
-    assert "| frame512, false | 0 of 2 (0 to 84 %) | 1 | 0 | 1 | 0.25, 0.25 | 0.5, 0.5 |" in run(
-        "table", tmp_path
-    )
+    assert "| frame512, false | 0 of 2 (0 to 84 %) | 1 | 0 | 1 | 0.25, 0.25 | 0.5, 0.5 |" in run("table", tmp_path)
