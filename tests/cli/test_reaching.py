@@ -11,7 +11,7 @@ import click
 import pytest
 from support.documents import commands
 
-from roadgeo.cli import queries, shards
+from roadgeo.cli import queries
 from roadgeo.cli.locate import Locate, locate_command
 from roadgeo.cli.options import Known, Method, Verbosity, fill, threaded
 from roadgeo.cli.track import Track, _frame_options, track_command
@@ -51,7 +51,7 @@ def test_no_option_is_taken_and_dropped(name: str, command: click.Command) -> No
         return  # all that it is given goes on
     (kind,) = [value for value in get_type_hints(run).values() if is_dataclass(value)]
     home = sys.modules[run.__module__]
-    helpers = [queries, shards] if name in ("index", "simulate", "evaluate") else []
+    helpers = [queries] if name in ("index", "simulate", "evaluate") else []
     taken = set.union(*(attributes(inspect.getfile(module)) for module in (home, *helpers)))
     taken |= {output.option.removeprefix("--") for output in registry.REGISTRY.values()} if name == "locate" else set()
     printed = {"as_json"}  # as the switches
