@@ -76,7 +76,6 @@ _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine, .np
 
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
-_MAX_SIDECAR = 1 << 20
 _MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
 _ARRAY = b"\x93NUMPY"
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
@@ -248,7 +247,7 @@ def read_palette(dataset: DatasetReader) -> AnyArray | None:
 def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
     """Return the nodata value in the `.aux.xml` beside a raster: all that is taken from such a file."""
     beside = Path(os.fspath(path) + ".aux.xml")
-    if not beside.is_file() or beside.stat().st_size > _MAX_SIDECAR:
+    if not beside.is_file():
         return None
     match = re.search(rb"<NoDataValue[^<>]*+>\s*+([-+.0-9eEnaif]{1,32})\s*+</", beside.read_bytes())
     try:

@@ -41,7 +41,7 @@ _SCHEMA = (
     (
         "Model",
         (
-            *(("version", 1, "int64"), ("graph", 7, "Graph"), ("metadata", 14, "Entry"), ("training", 20, "bytes")),
+            *(("version", 1, "int64"), ("graph", 7, "Graph"), ("metadata", 14, "Entry")),
             ("function", 25, "bytes"),
         ),
     ),
@@ -187,9 +187,8 @@ def _require_network(content: bytes) -> Any:
         raise ModelError("not an ONNX model, or damaged; export it again") from error
     if not model.version or len(model.graph) != 1:
         raise ModelError(f"not an ONNX model, or damaged: it holds {len(model.graph)} graphs; export it again")
-    for what, held in (("training steps", model.training), ("functions", model.function)):
-        if held:
-            raise ModelError(f"holds {what} of its own; expected a plain network: export it with its parts inlined")
+    if model.function:
+        raise ModelError("holds functions of its own; expected a plain network: export it with its parts inlined")
     (graph,) = model.graph
     if graph.sparse:
         raise ModelError("holds sparse tensors; expected dense ones: export it anew")

@@ -149,7 +149,7 @@ def test_a_model_that_takes_too_long_is_stopped(tmp_path: Path, monkeypatch: pyt
         open_onnx(path).run("road", np.zeros((1, 3, 64, 64), np.float32))
 
 
-def test_functions_and_training_are_refused(tmp_path: Path) -> None:
+def test_functions_are_refused(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "model.onnx")
     model = onnx.load(str(path))
     twin = helper.make_function(
