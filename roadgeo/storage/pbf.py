@@ -17,14 +17,13 @@ __all__ = ["read_blob", "read_parts"]
 #: Files are read in parts of about this size; the other two are limits of the specification.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 
-_PACKED = (("lzma", 4, "bytes"), ("bzip2", 5, "bytes"), ("lz4", 6, "bytes"), ("zstd", 7, "bytes"))
 #: The checked parts of a file.
-_PBF = (
-    ("BlobHeader", (("size", 3, "int64"),)),
-    ("Blob", (("raw", 1, "bytes"), ("zlib", 3, "bytes"), *_PACKED)),
-    ("Block", (("texts", 1, "bytes"),)),
-    ("Texts", (("text", 1, "bytes"),)),
-)
+_PBF = """
+    BlobHeader size:3:int64
+    Blob raw:1 zlib:3 lzma:4 bzip2:5 lz4:6 zstd:7
+    Block texts:1
+    Texts text:1
+"""
 
 
 def read_parts(path: Path) -> Iterator[tuple[bytes, float]]:

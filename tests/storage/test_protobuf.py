@@ -5,9 +5,7 @@ from google.protobuf.message import DecodeError
 
 from roadgeo.storage.protobuf import message_types
 
-MESSAGES = message_types(
-    (("Outer", (("inner", 1, "Inner"), ("number", 2, "int64"))), ("Inner", (("text", 3, "bytes"),)))
-)
+MESSAGES = message_types("Outer inner:1:Inner number:2:int64\n Inner text:3")
 
 
 def test_fields_are_told_and_others_passed_over() -> None:

@@ -37,38 +37,13 @@ _ORT = b"ORTM"  # where the file of another format has it, which onnxruntime wou
 _STRING = 8  # of TensorProto.DataType
 
 #: The checked parts of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
-_SCHEMA = (
-    (
-        "Model",
-        (
-            *(("version", 1, "int64"), ("graph", 7, "Graph"), ("metadata", 14, "Entry")),
-            ("function", 25, "bytes"),
-        ),
-    ),
-    ("Graph", (("node", 1, "Node"), ("stored", 5, "Tensor"), ("input", 11, "Value"), ("sparse", 15, "bytes"))),
-    ("Entry", (("key", 1, "bytes"), ("value", 2, "bytes"))),
-    ("Value", (("type", 2, "Type"),)),
-    ("Type", (("tensor", 1, "Numbers"),)),
-    ("Numbers", (("shape", 2, "Shape"),)),
-    ("Shape", (("side", 1, "Side"),)),
-    ("Side", (("length", 1, "int64"),)),
-    ("Node", (("output", 2, "bytes"), ("operator", 4, "bytes"), ("attribute", 5, "Attribute"), ("domain", 7, "bytes"))),
-    (
-        "Attribute",
-        (
-            *(
-                ("name", 1, "bytes"),
-                ("number", 3, "int64"),
-                ("tensor", 5, "Tensor"),
-                ("tensors", 10, "Tensor"),
-                ("graph", 6, "bytes"),
-                ("graphs", 11, "bytes"),
-            ),
-            *(("sparse", 22, "bytes"), ("sparses", 23, "bytes")),
-        ),
-    ),
-    ("Tensor", (("kind", 2, "int64"), ("external", 13, "bytes"), ("location", 14, "int64"))),
-)
+_SCHEMA = """
+    Model version:1:int64 graph:7:Graph function:25
+    Graph node:1:Node stored:5:Tensor sparse:15
+    Node output:2 operator:4 attribute:5:Attribute domain:7
+    Attribute name:1 number:3:int64 tensor:5:Tensor tensors:10:Tensor graph:6 graphs:11 sparse:22 sparses:23
+    Tensor kind:2:int64 external:13 location:14:int64
+"""
 
 
 class Port(NamedTuple):
