@@ -29,7 +29,6 @@ _MAX_NODES = 20_000
 _MAX_MEMORY = 4 << 30  # bytes of all open models, with their working memory
 _MAX_SECONDS = 600.0  # of one tile
 
-_CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 #: Operators on text, of which a few numbers make any amount.
 _TEXT = {"StringConcat", "StringNormalizer", "StringSplit", "RegexFullMatch", "TfIdfVectorizer"}
@@ -181,16 +180,18 @@ def _require_plain(node: Any) -> None:
     for domain in map(_text, node.domain):
         if domain not in ("", "ai.onnx"):
             raise ModelError(f"uses the operator {domain}.{operator}; expected ONNX's own: export it without others")
-    if operator in _CONTROL | _RANDOM or len(node.operator) > 1:
-        what = "random numbers" if operator in _RANDOM else "control flow"
-        raise ModelError(f"uses {what} ({operator}); expected a plain network: export it anew")
-    to_text = any(attribute.name == [b"to"] and _STRING in attribute.number for attribute in node.attribute)
-    if operator in _TEXT or (operator == "Cast" and to_text):
-        raise ModelError(f"computes with text ({operator}); expected a network for pictures")
-    for attribute in node.attribute:
-        if attribute.graph or attribute.graphs or attribute.sparse or attribute.sparses:
-            raise ModelError("holds graphs or sparse tensors within operators; expected a plain network")
-        _require_numbers([*attribute.tensor, *attribute.tensors])
+    held = node.attribute
+    to_text = any(attribute.name == [b"to"] and _STRING in attribute.number for attribute in held)
+    uses = {
+        "random numbers": operator in _RANDOM,
+        "control flow": len(node.operator) > 1 or any(attribute.graph or attribute.graphs for attribute in held),
+        "text": operator in _TEXT or (operator == "Cast" and to_text),
+        "sparse tensors": any(attribute.sparse or attribute.sparses for attribute in held),
+    }
+    for what, is_used in uses.items():
+        if is_used:
+            raise ModelError(f"uses {what} ({operator}); expected a plain network for pictures: export it anew")
+    _require_numbers(tensor for attribute in held for tensor in (*attribute.tensor, *attribute.tensors))
 
 
 def _require_numbers(tensors: Iterable[Any]) -> None:

@@ -81,9 +81,9 @@ HOSTILE = {
             [node("Cast", ["image"], ["t"], to=TensorProto.STRING), node("StringConcat", ["t", "t"], ["road"])],
             [],
         ),
-        "computes with text",
+        "uses text",
     ),
-    "patterns": (lambda: ([node("RegexFullMatch", ["image"], ["road"], pattern="(a*)*b")], []), "computes with text"),
+    "patterns": (lambda: ([node("RegexFullMatch", ["image"], ["road"], pattern="(a*)*b")], []), "uses text"),
     "strings": (lambda: ([], [tensor("w", TensorProto.STRING, [1], string_data=[b"x"])]), "a tensor of text"),
 }
 
