@@ -36,6 +36,9 @@ _LOG = logging.getLogger(__name__)
 
 #: Name in results of a picture that is no file.
 _ARRAY = "array"
+#: Scale of roads given as lines in metres, a factor either way, and their tilt, degrees: they were measured on the
+#: ground, or on a map.
+_SCALED, _TILTED_DEG = 1.05, 10.0
 
 
 def locate_query(
@@ -217,8 +220,8 @@ def _locate_lines(
     if drawing.middle is not None and swapped_near((*drawing.middle, 1000.0), references) is not None:
         _LOG.warning("%s: its coordinates lie on none of the maps; %s", visible(path), EXCHANGED)
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
-        scale = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
-        tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map
+        scale = (drawing.unit_m / _SCALED, drawing.unit_m * _SCALED)
+        tilt = min(camera.max_tilt_deg, _TILTED_DEG)
         camera = replace(camera, gsd_m=scale, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
     options = replace(options, match=replace(options.match, camera=camera))
     sighting = locate_passes([drawing.mask], lambda mask: PassRoads("its lines", mask), references, options, how)

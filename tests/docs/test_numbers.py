@@ -1,25 +1,59 @@
-"""Numbers that pages take from the code, or from another page, are those that stand there."""
-
-import csv
-import re
+"""Numbers that pages take from the code are those that stand there."""
 
 import numpy as np
-import pytest
-from support.documents import ROOT
+from support.documents import said, value
 
+from roadgeo.evaluation.noise import NOISE_MODELS
+from roadgeo.evaluation.scoring import share
+from roadgeo.flights import tracker
+from roadgeo.geometry import pose, projection
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN
+from roadgeo.geometry.transformation import exactness
 from roadgeo.kernels.road_rings import BEARINGS, RINGS
-from roadgeo.location import ERROR_RATES
-from roadgeo.matching import evidence, picture, rivals, triples, verdict, veto
+from roadgeo.kernels.triple_codes import MAX_ANCHORS
+from roadgeo.matching import (
+    checking,
+    evidence,
+    hints,
+    pairs,
+    paper,
+    picture,
+    rivals,
+    road_search,
+    scene,
+    triples,
+    verdict,
+    veto,
+)
+from roadgeo.matching.index import COARSENESS
+from roadgeo.matching.methods import N_PLACES
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper import PairOptions
 from roadgeo.matching.search import SearchOptions
+from roadgeo.matching.shifts import LocalSearchOptions
+from roadgeo.outputs import location_layers, subject
+from roadgeo.roads import intersections, vectorization
 from roadgeo.roads.intersections import IntersectionOptions
+from roadgeo.running import photographs, queries, sharding
+from roadgeo.serving import guard, server, workers
+from roadgeo.serving.options import ServeOptions
+from roadgeo.sources import camera, masks, overpass
+from roadgeo.sources.segmentation import onnx_file, scales
+from roadgeo.storage import memory, rasters, unpacking, vectors
 
-CAMERA, PAIR, TANGENT = CameraOptions(), PairOptions(), IntersectionOptions()
+CAMERA, PAIR, TANGENT, SERVE = CameraOptions(), PairOptions(), IntersectionOptions(), ServeOptions()
+NEARBY, CHECK = LocalSearchOptions(), checking.CheckOptions()
 NEEDED = LocateOptions().min_log10_odds
-WORDS = {"half": 0.5, "a tenth": 0.1, "two thirds": 0.67, "four": 4, "eight": 8, "ten": 10}
 SECTION_8 = "docs/how-it-works.md"
+MIB, GIB = 1 << 20, 1 << 30
+
+
+def noise(name: str) -> tuple[float, ...]:
+    """Return the least and the greatest share of missing and of false roads of a kind of mask, percent."""
+    model = NOISE_MODELS[name]
+    return tuple(round(100.0 * part, 6) for part in (*model.missing, *model.false_roads))
+
 
 #: Page; what it says, with a group for each number; the numbers in the code.
 FROM_CODE = [
@@ -61,8 +95,134 @@ FROM_CODE = [
     ("docs/scale.md", r"map of more than ([\d,]+) intersections a place also", triples._USUAL_SIZE),
     ("docs/commands/locate.md", r"`--max-tilt 20` \| the default is (\d+)", CAMERA.max_tilt_deg),
     ("docs/commands/locate.md", r"some (\w+) seconds of a usual machine at most", SearchOptions().work_limit_s),
+    ("docs/commands/locate.md", r"GDAL reads, (\d+) to ([\d,]+) pixels", (masks.MIN_SIDE, masks.MAX_SIDE)),
+    (
+        "docs/commands/locate.md",
+        r"([\d.]+) alone stands for ([\d.]+) to ([\d.]+)\.",
+        (0.3, 0.3 / hints._GSD_FACTOR, 0.3 * hints._GSD_FACTOR),
+    ),
+    ("docs/commands/locate.md", r"scale is known to (\d+) %", round(100 * (queries._SCALED - 1))),
+    ("docs/commands/locate.md", r"may be off \(default (\d+)\)", hints._HEADING_OFF_DEG),
+    ("docs/commands/locate.md", r"original pixels: (\d+) control points", subject._GRID**2),
+    ("docs/commands/locate.md", r"lists up to (\w+) places", N_PLACES),
+    ("docs/commands/locate.md", r"and the best (\w+), each", N_PLACES),
+    ("docs/commands/locate.md", r"Beyond (\d+) % of the frame's side", 100 * verdict._MOST_UNSURE),
+    ("docs/commands/locate.md", r"height is known to (\d+) % only", 100 * pose.USUAL_SIGMA),
+    ("docs/masks.md", r"size from (\d+) to ([\d,]+) pixels", (masks.MIN_SIDE, masks.MAX_SIDE)),
+    ("docs/faq.md", r"err: (\d+) m where no accuracy", camera._POSITION_M),
+    ("docs/faq.md", r"(\d+) m from ETRS89", exactness("EPSG:25832", "EPSG:4326", (10.0, 50.0)).sigma_m),
+    (
+        "docs/faq.md",
+        r"to WGS 84, (\d+) m from the British",
+        exactness("EPSG:27700", "EPSG:4326", (-1.0, 52.0)).sigma_m,
+    ),
+    ("docs/faq.md", r"range of at least (\d+) m of height", camera._HEIGHT_M),
+    ("docs/faq.md", r"from a compass, within (\d+) degrees", camera._YAW_OFF_DEG),
+    (
+        "docs/faq.md",
+        r"`segmented` above lacks (\d+) to (\d+) % of the roads and has (\d+) to (\d+) % false ones",
+        noise("segmented"),
+    ),
+    (
+        "docs/faq.md",
+        r"`poor` (\d+) to (\d+) % and (\d+) to (\d+) %",
+        noise("poor"),
+    ),
+    (
+        "docs/commands/evaluate.md",
+        r"\((\d+)-(\d+) % of the roads missing, (\d+)-(\d+) % false\)",
+        noise("segmented"),
+    ),
+    (
+        "docs/commands/evaluate.md",
+        r"`poor`: a weak one \((\d+)-(\d+) %, (\d+)-(\d+) %\)",
+        noise("poor"),
+    ),
+    (
+        "docs/commands/evaluate.md",
+        r"(\d+) right leave a recall between (\d+) and (\d+) %",
+        (40, round(100 * share(40, 40).low), 100 * share(40, 40).high),
+    ),
+    ("docs/commands/verify.md", r"`--tolerance` \((\d+) m\)", CHECK.tolerance_m),
+    (
+        "docs/commands/verify.md",
+        r"`--reach` \((\d+) m\) and `--max-turn` \((\d+)°\)",
+        (NEARBY.reach_m, NEARBY.turn_deg),
+    ),
+    (
+        "docs/commands/verify.md",
+        r"needs a score of (\d+), or of (\d+) where",
+        (checking._MIN_SCORE, checking._MIN_SCORE_AS_GIVEN),
+    ),
+    ("docs/commands/verify.md", r"`IMAGE_fixed.points`: (\d+) control points", subject._GRID**2),
+    ("docs/commands/track.md", r"compared with the (\w+) before", tracker._N_BEFORE),
+    (
+        "docs/commands/track.md",
+        r"odds may fall below (\w+) of theirs while the share of its roads that lie on the map falls by ([\d.]+),",
+        (tracker._FALLEN, tracker._SHARE_FALLEN),
+    ),
+    ("docs/commands/serve.md", r"a head (\d+) KiB", server._HEAD_BYTES >> 10),
+    ("docs/commands/serve.md", r"must come within (\d+) seconds", SERVE.body_s),
+    ("docs/commands/serve.md", r"`--waiting` \+ (\d+) connections", SERVE.connections),
+    (
+        "docs/commands/serve.md",
+        r"takes (\d+) seconds more is ended: 503; a job has (\d+) seconds more",
+        (workers._GRACE_S, workers._PATIENT_S),
+    ),
+    ("docs/commands/serve.md", r"latest (\w+) answers stay", SERVE.kept_jobs),
+    ("docs/photographs.md", r"from 0 to (\d+). Nodata \((\d+)\)", (PROBABILITY_SURE, PROBABILITY_UNKNOWN)),
+    ("docs/photographs.md", r"then up to (\w+) scales", photographs._MAX_SCALES),
+    ("docs/photographs.md", r"is enlarged, at most (\w+) times", scales._MOST_ENLARGED),
+    (
+        "docs/photographs.md",
+        r"gets (\d+) GiB of memory and (\w+) minutes for a tile",
+        (onnx_file._MAX_MEMORY / GIB, onnx_file._MAX_SECONDS / 60.0),
+    ),
+    ("docs/qgis.md", r"are drawn (\d+) times as long", location_layers._EXAGGERATION),
+    ("docs/references.md", r"kept for (\d+) days", overpass._MOST_AGE_S / 86400.0),
+    (
+        "docs/references.md",
+        r"true to scale \(([\d.]+) %\) and angle \(([\d.]+)°\)",
+        (100.0 * projection._MOST_SCALE_ERROR, projection._MOST_ANGLE_DEG),
+    ),
+    ("docs/references.md", r"pieces of some ([\d,]+) straight", sharding._SEGMENTS),
+    ("docs/references.md", r"not smaller than (\d+) km\)", sharding._CELL_M / 1000.0),
+    ("docs/references.md", r"neighbours share. (\d+) km by default", sharding.ShardOptions().margin_m / 1000.0),
+    (
+        "docs/references.md",
+        r"Images of (\d+) to (\d+) m pixels",
+        (round(COARSENESS * road_search.COARSE_PIXEL_M), CAMERA.gsd_m[1]),
+    ),
+    ("docs/references.md", r"merged (\w+) times as far as usual", COARSENESS),
+    ("docs/references.md", r"where `--gsd` is below (\d+) m", round(COARSENESS * road_search.COARSE_PIXEL_M)),
+    ("docs/scale.md", r"more than (\d+) megapixels", vectorization._MAX_WORKING_PIXELS / 1e6),
+    ("docs/scale.md", r"keeps up to ([\d.]+) GB of road rasters", road_search._MOST_BYTES / 1e9),
+    ("docs/scale.md", r"at most 2\^(\d+) intersections \(([\d.]+) million\)", (24, round(MAX_ANCHORS / 1e6, 1))),
+    ("SECURITY.md", r"among (\w+) formats; NumPy", len(rasters._DRIVERS) - 1),
+    ("SECURITY.md", r"GDAL has (\d+) drivers", len(vectors._DRIVERS)),
+    (
+        "SECURITY.md",
+        r"unpack to (\d+) MiB plus (\d+) times their size",
+        (unpacking._FREE / MIB, unpacking._TIMES),
+    ),
+    (
+        "SECURITY.md",
+        r"they run: (\d+) GiB of memory, whatever operator asks for it, and (\w+) minutes for a tile",
+        (onnx_file._MAX_MEMORY / GIB, onnx_file._MAX_SECONDS / 60.0),
+    ),
+    ("SECURITY.md", r"takes at most (\d+) GB of memory and (\d+) times", (memory._FREE / GIB, memory._TIMES)),
+    (
+        "SECURITY.md",
+        r"is of (\d+) MB at most, comes within (\w+) minutes",
+        (overpass._MOST_BYTES / MIB, overpass._MOST_S / 60.0),
+    ),
+    ("SECURITY.md", r"one after another, (half) a second apart", guard._GUESS_S),
     ("docs/how-well.md", r"\| ([\d.]+) to 5 \|", NEEDED),
     ("docs/paper.md", r"are fitted at (\d+) to (\d+) m", (TANGENT.skip_length, TANGENT.tangent_length)),
+    ("docs/paper.md", r"([\d.]+) to ([\d.]+) road widths in a mask", (scene._SKIP, scene._TANGENT)),
+    ("docs/paper.md", r"a line with the weight ([\d.]+):", intersections._STIFFNESS),
+    ("docs/paper.md", r"On the map only, from (\d+) m on", pairs._SKIP_M),
+    ("docs/paper.md", r"At most ([\d,]+) intersections of a mask", paper._MAX_TUPLE_INTERSECTIONS),
     ("docs/paper.md", r"first `n_px` = (\d+) pixels", PAIR.n_px),
     ("docs/paper.md", r"average error ([\d.]+) pixels", PAIR.fit_error_px),
     ("docs/paper.md", r"The center moves (\d+) m at most", TANGENT.max_shift),
@@ -80,92 +240,8 @@ FROM_CODE = [
     ("docs/paper.md", r"also ends after (\d+) s of counted work", PAIR.work_limit_s),
 ]
 
-#: Page; what it says; what another page says, whose numbers are the same.
-FROM_PAGES = [
-    ("README.md", r"steep views \| (\d+) of (\d+) \| 0 \|", "docs/how-well.md", r"(\d+) of (\d+) masks are located"),
-    ("README.md", r"\| ([\d,]+) of ([\d,]+) \| 3 \|", "docs/how-well.md", r"full effort locates ([\d,]+) of ([\d,]+)"),
-    (
-        "README.md",
-        r"data \| (\d+) of (\d+) \((\d+) to (\d+) %\)",
-        "docs/how-well.md",
-        r"blind \| (\d+) of (\d+) \((\d+) to (\d+) %\)",
-    ),
-    ("README.md", r"(\w+) of ([\d,]+) masks without", "docs/how-well.md", r"\*\*(\w+) of ([\d,]+) masks without"),
-    ("README.md", r"later and ([\d.]+) GB of disk", "docs/install.md", r"It takes about ([\d.]+) GB of disk"),
-]
-
-
-def said(page: str, sentence: str) -> tuple[str, ...]:
-    """Return the groups of a pattern on a page, whose lines are joined."""
-    found = re.search(sentence, " ".join((ROOT / page).read_text(encoding="utf-8").split()))
-    assert found, f"{page} no longer says: {sentence}"
-    return found.groups()
-
-
-def value(text: str) -> float:
-    """Return the number that a text is, in digits or a word."""
-    return WORDS[text] if text in WORDS else float(text.replace(",", ""))
-
-
-#: A command of this repository, or a folder of its examples that keeps results.
-SOURCE = re.compile(r"`roadgeo \w+|`python\s+examples/|\]\((\.\./)?examples/|`examples/\w")
-
-
-def parts(page: str, mark: str) -> dict[str, str]:
-    """Return the parts of a page by their first lines; each begins with a mark."""
-    text = (ROOT / page).read_text(encoding="utf-8")
-    found = re.split(rf"^{mark}", text, flags=re.MULTILINE)[1:]
-    return {part.splitlines()[0]: part for part in found}
-
-
-def anchor(heading: str) -> str:
-    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
-
-
-def has_number(text: str) -> bool:
-    """Whether a text states a number, beside those in code, links and comments."""
-    return bool(re.search(r"\d", re.sub(r"`[^`]*`|\]\([^)]*\)|<!--.*?-->", "", text)))
-
-
-def test_a_section_with_numbers_names_the_command_or_the_results_that_they_come_from():
-    sections = parts("docs/how-well.md", "## ")
-    assert [name for name, text in sections.items() if has_number(text) and not SOURCE.search(text)] == []
-
-
-def test_a_number_of_the_readme_leads_to_the_section_that_it_comes_from():
-    how_well = parts("README.md", "## ")["How well"].replace("The range is a 95 % interval.", "")
-    known = [f"](docs/how-well.md#{anchor(name)})" for name in parts("docs/how-well.md", "## ")]
-    *rows, text = [block for block in re.split(r"\n(?=\|)|\n\n", how_well) if block.strip()]
-    said = [one for one in [*rows, *re.split(r"\.\s", text)] if has_number(one)]
-    assert [one for one in said if not any(link in one for link in known)] == []
-
 
 def test_pages_state_the_numbers_of_the_code():
     stated = {(page, sentence): [value(text) for text in said(page, sentence)] for page, sentence, _ in FROM_CODE}
     known = {(page, sentence): list(np.atleast_1d(numbers)) for page, sentence, numbers in FROM_CODE}
     assert stated == known
-
-
-def test_pages_state_the_numbers_of_other_pages():
-    stated = [(said(page, sentence), said(source, there)) for page, sentence, source, there in FROM_PAGES]
-    assert [here for here, _ in stated] == [there for _, there in stated]
-
-
-def test_the_page_of_verify_counts_its_kept_results():
-    with (ROOT / "examples/verify/results/grids_seed77.csv").open(newline="") as file:
-        rows = [(float(row["off_m"]), row["verdict"]) for row in csv.DictReader(file)]
-    near = [verdict for off_m, verdict in rows if 0.0 <= off_m <= 100.0]
-    far = [verdict for off_m, verdict in rows if off_m >= 500.0]
-    counted = len(far), len(near) - near.count("unknown"), len(near), set(far)
-    none_of, *judged = said(
-        "docs/commands/verify.md", r"none of (\d+) is judged. 0, 30 and 100 m off (\d+) of (\d+) are judged"
-    )
-    assert (int(none_of), *map(int, judged), {"unknown"}) == counted
-
-
-def test_the_table_of_error_rates_is_that_of_results():
-    text = (ROOT / "docs/how-well.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([\d.]+) (?:to|and).*\| ([\d,]+) \| (\d+) \(at most ([\d.]+) %\) \|$", text, re.MULTILINE)
-    assert [tuple(map(value, row)) for row in rows] == [
-        (rate.score, rate.reported, rate.wrong, pytest.approx(100.0 * rate.at_most, rel=0.02)) for rate in ERROR_RATES
-    ]

@@ -51,6 +51,35 @@ def prose(text):
     return FENCE.sub("", text)
 
 
+#: Numbers that pages write as words.
+WORDS = {
+    "half": 0.5,
+    "a tenth": 0.1,
+    "two thirds": 0.67,
+    "two": 2,
+    "three": 3,
+    "four": 4,
+    "five": 5,
+    "six": 6,
+    "eight": 8,
+    "nine": 9,
+    "ten": 10,
+    "twenty": 20,
+}
+
+
+def said(page: str, sentence: str) -> tuple[str, ...]:
+    """Return the groups of a pattern on a page, whose lines are joined."""
+    found = re.search(sentence, " ".join((ROOT / page).read_text(encoding="utf-8").split()))
+    assert found, f"{page} no longer says: {sentence}"
+    return found.groups()
+
+
+def value(text: str) -> float:
+    """Return the number that a text is, in digits or a word."""
+    return WORDS[text.lower()] if text.lower() in WORDS else float(text.replace(",", ""))
+
+
 # --- running ----------------------------------------------------------------------------------------------------------
 
 
