@@ -7,7 +7,6 @@ The file's name determines its format: OpenStreetMap data through osmium, answer
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -191,15 +190,9 @@ def _undeclared(path: Path, layer: str, skip: int, most: int | None, meta: dict[
     taken = _take_shapes(columns)
     if taken is None:
         raise NoRoadsError(f"{path}: layer {layer!r} has no geometry, nor a column of WKT or WKB; expected lines")
-    if data.driver == "CSV" and len(taken[0]) and taken[0][-1] is None and not _ends_in_a_line(path):
+    if data.driver == "CSV" and len(taken[0]) and taken[0][-1] is None and _ends(path, 1)[1] not in b"\r\n":
         raise RoadSourceError(f"{path}: is cut off in its last line; copy or export it again")
     return RoadTable(taken[0], data.crs or taken[1] or None, columns, meta)
-
-
-def _ends_in_a_line(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read() in b"\r\n"
 
 
 def _choose_parts(path: Path, asked: Sequence[str], *, areas: bool) -> list[_Part]:
@@ -285,11 +278,8 @@ def _what_is_wrong(path: Path) -> str:
     """Return why a file is none: nothing, or another thing, came in its place, or it ends too early; "" of others."""
     if not path.is_file():
         return ""
-    ending, size = path.suffix.lower(), path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-        file.seek(max(size - _HEAD_BYTES, 0))
-        last = file.read().rstrip()
+    ending, size, (head, tail) = path.suffix.lower(), path.stat().st_size, _ends(path, _HEAD_BYTES)
+    last = tail.rstrip()
     has_open_text = ending == ".csv" and sum(chunk.count(b'"') for chunk in read_chunks(path)) % 2 > 0
     if not head.strip():
         return "is empty; copy or export it again"
@@ -305,16 +295,21 @@ def _what_is_wrong(path: Path) -> str:
     return f"is cut off after {size:,} bytes; copy or export it again" if is_cut else ""
 
 
+def _ends(path: Path, n: int) -> tuple[bytes, bytes]:
+    """Return how a file begins and how it ends, n bytes each."""
+    with path.open("rb") as file:
+        first = file.read(n)
+        file.seek(max(path.stat().st_size - n, 0))
+        return first, file.read()
+
+
 def what_is_missing(path: Path, n_features: int) -> str:
     """Return the note of a service's answer on features that it left out: "" where it is whole, or has no note."""
     ending = path.suffix.lower()
     if ending not in (".json", ".geojson", ".gml"):
         return ""
-    with path.open("rb") as file:
-        text = file.read(_ENDS_BYTES)
-        if ending != ".gml":
-            file.seek(max(path.stat().st_size - _ENDS_BYTES, 0))
-            text += file.read()
+    first, last = _ends(path, _ENDS_BYTES)
+    text = first if ending == ".gml" else first + last
     matched = max((int(match[1]) for match in _MATCHED.finditer(text)), default=0)
     limited = _LIMITED.search(text)
     if matched > n_features:
@@ -336,7 +331,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
     try:
         with pq.ParquetFile(path) as file:
             _require_rows(file.metadata.num_rows, path.stat().st_size)
-            shape_column, crs, encoding = _geometry_of(file.schema_arrow)
+            shape_column, crs, encoding = _declared(file.schema_arrow) or _named_shapes(file.schema_arrow)
             names = [name for name in file.schema_arrow.names if name != shape_column]
             leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
         wanted = [name for name in names if is_known_column(name)] or names
@@ -362,11 +357,8 @@ def _require_rows(rows: int, size: int) -> None:
         raise ValueError(f"its {size:,} bytes claim to hold {rows:,} rows")
 
 
-def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> tuple[str, Any, str]:
-    """Return the geometry column of a table of Arrow's or of Parquet, its CRS and its encoding.
-
-    `first` returns a value of a column, by which it is known where no name shows it.
-    """
+def _declared(schema: Any) -> tuple[str, Any, str] | None:
+    """Return the geometry column that a table of Arrow's or of Parquet declares, its CRS and its encoding; or None."""
     stored = schema.metadata or {}
     if b"geo" in stored:
         geo = json.loads(stored[b"geo"])
@@ -378,18 +370,16 @@ def _geometry_of(schema: Any, first: Callable[[str], Any] = lambda _: None) -> t
         if named.startswith(("geoarrow.", "ogc.")):
             about = json.loads(extension.get(b"ARROW:extension:metadata") or "{}")
             return field.name, about.get("crs"), named.split(".")[1]
-    texts = [field.name for field in schema if str(field.type).removeprefix("large_").removesuffix("_view") in _TEXTS]
-    shape_column = next((name for name in texts if name.lower() in _SHAPES), None) or next(
-        (name for name in texts if _is_shape(first(name))), None
-    )
-    if shape_column is None:
-        raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
-    return shape_column, None, "WKB"
+    return None
 
 
-def _is_shape(value: Any) -> bool:
-    """Whether a value is WKB or WKT."""
-    return isinstance(value, bytes | bytearray | memoryview | str) and _read_shapes([value])[0][0] is not None
+def _named_shapes(schema: Any) -> tuple[str, None, str]:
+    """Return the column that is named as one with shapes; the rest as `_declared` does."""
+    for field in schema:
+        kind = str(field.type).removeprefix("large_").removesuffix("_view")
+        if field.name.lower() in _SHAPES and kind in _TEXTS:
+            return field.name, None, "WKB"
+    raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
 
 
 def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
@@ -465,14 +455,12 @@ def _arrow_table(roads: Any) -> RoadTable:
 
     try:
         table = pa.table(roads)
-        column, crs, encoding = _geometry_of(table.schema, lambda name: _first(table[name].to_pylist()))
-        shapes, srid = _shapes(table, column, encoding)
+        own, crs, encoding = _declared(table.schema) or ("", None, "")
+        shapes, srid = _shapes(table, own, encoding) if own else (np.empty(0, object), 0)
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
         raise _unreadable(roads, first_line(error)) from error
-    if len(shapes) and not any(shapes):
-        raise _unreadable(roads, f"its column {column!r} holds neither WKB nor WKT")
-    columns = {name: objects(table[name].to_pylist()) for name in table.column_names if name != column}
-    return RoadTable(shapes, crs or srid or None, columns)
+    columns = {name: objects(table[name].to_pylist()) for name in table.column_names if name != own}
+    return RoadTable(shapes, crs or srid or None, columns) if own else _of_values(roads, columns)
 
 
 def _held_columns(roads: Any) -> RoadTable:
@@ -486,6 +474,11 @@ def _held_columns(roads: Any) -> RoadTable:
     if name is not None:
         shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
         return RoadTable(shapes, getattr(roads, "crs", None), columns)
+    return _of_values(roads, columns)
+
+
+def _of_values(roads: Any, columns: dict[str, AnyArray]) -> RoadTable:
+    """Return a table of which a column, by its values, holds WKB or WKT."""
     try:
         taken = _take_shapes(columns)
     except TypeError as error:
@@ -497,13 +490,11 @@ def _held_columns(roads: Any) -> RoadTable:
 
 def _take_shapes(columns: dict[str, AnyArray]) -> tuple[AnyArray, int] | None:
     """Take the column that holds WKB or WKT out of others: its shapes, and the number of their CRS, or 0; else None."""
-    name = next((name for name, values in columns.items() if _is_shape(_first(values))), None)
-    return None if name is None else _read_shapes([value if is_filled(value) else None for value in columns.pop(name)])
-
-
-def _first(values: Sequence[Any] | AnyArray) -> Any:
-    """Return the first value that is one."""
-    return next((value for value in values if is_filled(value)), None)
+    for name in sorted(columns, key=lambda name: name.lower() not in _SHAPES):
+        first = next((value for value in columns[name] if is_filled(value)), None)
+        if isinstance(first, bytes | bytearray | memoryview | str) and _read_shapes([first])[0][0] is not None:
+            return _read_shapes([value if is_filled(value) else None for value in columns.pop(name)])
+    return None
 
 
 def _unreadable(roads: Any, why: str) -> RoadSourceError:
@@ -565,9 +556,8 @@ def _node_place(graph: Any, node: Any) -> tuple[float, float] | None:
 
 def _overpass_elements(path: Path) -> list[Any] | None:
     """Return the elements of an answer of Overpass as JSON; None: it is another file."""
-    with path.open("rb") as file:
-        if b'"elements"' not in file.read(1 << 16):
-            return None
+    if b'"elements"' not in _ends(path, _ENDS_BYTES)[0]:
+        return None
     try:
         answer = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
