@@ -47,15 +47,14 @@ def _by_word(kinds: Mapping[str, Sequence[str]]) -> dict[str, str]:
 _DATA = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _WORDS = {maker: _by_word(kinds) for maker, kinds in _DATA["words"].items()}
 _CODES = {column: _by_word(kinds) for column, kinds in _DATA["codes"].items()}
-_SURE, _GENERAL, _TUNNELS, _NAMES, _TAGS, _OTHER_KEYS = (
-    _DATA["columns"][of] for of in ("kind", "general", "tunnel", "name", "tags", "other")
-)
+_SURE, _GENERAL, _NAMES, _TAGS, _OTHERS = (_DATA["columns"][of] for of in ("kind", "general", "name", "tags", "other"))
+_TUNNELS = _DATA["tunnels"]
 _KINDS = [*_SURE, *_GENERAL]
 _OSM_NAME, _OVERTURE = "OpenStreetMap", "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0"
 _OSM = _WORDS[_OSM_NAME] | _by_word({word: [word] for word in KNOWN_HIGHWAYS} | {_NONE: sorted(NO_ROADS)})
 _WORDS[_OSM_NAME] = _OSM
 _HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
-_OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHER_KEYS}
+_OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHERS}
 #: Words that show that a line is a road, or none, whatever column they stand in.
 _AMBIGUOUS = {*map(_plain, _DATA["ambiguous"])}
 _CERTAIN = {
@@ -117,7 +116,7 @@ class Schema:
         lines, place = simple_lines(parted)
         areas = simple_areas(shapes)
         row = np.flatnonzero(~others)[of[place]]
-        hidden = [_each(columns[name], _HIDDEN.get(name, _itself)) for name in _TUNNELS if name in columns]
+        hidden = [_each(columns[name], partial(_tunnel_of, name)) for name in _TUNNELS if name in columns]
         hidden += [_tag(columns[name], "tunnel") for name in _TAGS if name in columns]
         tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
         called = next((columns[name] for name in _NAMES if name in columns), None)
@@ -143,7 +142,7 @@ class Schema:
             kinds = np.where((kinds == "") | ((kinds == _ROAD) & (stated != "")), stated, kinds)
             others |= stated == _NONE
         unknown = kinds == ""
-        for name in _OTHER_KEYS:
+        for name in _OTHERS:
             others |= unknown & (_each(columns[name], is_filled).astype(bool) if name in columns else False)
         said = [_tag(columns[name], _AREA) for name in _TAGS if name in columns]
         for values in said + [columns[name] for name in (_AREA,) if name in columns]:
@@ -327,25 +326,12 @@ def _json(value: Any) -> Any:
         return value
 
 
-def _itself(value: Any) -> Any:
-    return value
-
-
-def _below(value: Any) -> str:
-    """Return whether the IGN has a road below the ground: a number below 0."""
-    return "yes" if str(value).strip().startswith("-") else "no"
-
-
-#: Tunnels in columns of other names.
-_HIDDEN: dict[str, Callable[[Any], Any]] = {
-    "road_flags": _flags,
-    "pos_sol": _below,
-    "position_p": _below,
-    "medium": lambda value: "yes" if str(value).strip().lower() in ("u", "under terrenget") else "no",
-    **dict.fromkeys(
-        ("structure", "road_struc", "roadstruct"), lambda value: "yes" if "tunnel" in str(value).lower() else "no"
-    ),
-}
+def _tunnel_of(name: str, value: Any) -> Any:
+    """Return OpenStreetMap's words for what a column of this name tells of a tunnel."""
+    if name == "road_flags":
+        return _flags(value)
+    begins = _TUNNELS[name]
+    return value if not begins else "yes" if re.match(begins, str(value).strip(), re.IGNORECASE) else "no"
 
 
 def _count_broken(shapes: AnyArray) -> int:
