@@ -1,7 +1,9 @@
 """Numbers that pages take from the code are those that stand there."""
 
+import re
+
 import numpy as np
-from support.documents import said, value
+from support.documents import ROOT, said, value
 
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.scoring import share
@@ -29,7 +31,7 @@ from roadgeo.matching import (
 from roadgeo.matching.index import COARSENESS
 from roadgeo.matching.methods import N_PLACES
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.paper import PairOptions
+from roadgeo.matching.paper import PAPER, PairOptions
 from roadgeo.matching.search import SearchOptions
 from roadgeo.matching.shifts import LocalSearchOptions
 from roadgeo.outputs import location_layers, subject
@@ -245,3 +247,10 @@ def test_pages_state_the_numbers_of_the_code():
     stated = {(page, sentence): [value(text) for text in said(page, sentence)] for page, sentence, _ in FROM_CODE}
     known = {(page, sentence): list(np.atleast_1d(numbers)) for page, sentence, numbers in FROM_CODE}
     assert stated == known
+
+
+def test_the_page_of_the_paper_names_every_option_and_those_of_the_paper():
+    text = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
+    assert [name for name in paper._ALLOWED if f"`{name}" not in text] == []
+    marked = re.findall(r"\*\(p\)\* `(\w+=\w+)`", text)
+    assert paper.read_options(marked, PAIR) == PAPER

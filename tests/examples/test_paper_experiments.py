@@ -7,11 +7,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from worlds.demo import MASKS
 from worlds.towns import lattice_town
 
+from roadgeo.matching import methods
+from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.network_file import write_network
+from roadgeo.reference.opening import open_reference
 from roadgeo.roads.intersections import find_intersections
 from roadgeo.roads.network import RoadNetwork, as_stored
+from roadgeo.workflows import locate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 
@@ -41,6 +46,18 @@ def test_an_experiment_runs(name, town, tmp_path):
     assert "precision" in done.stdout
     assert json.loads((tmp_path / f"{name}.json").read_text())["queries"] == 1
     assert (tmp_path / f"{name}.png").is_file()
+
+
+def test_the_experiments_form_the_tuples_of_the_product(porto, tmp_path, monkeypatch):
+    """Of Porto: those that Figure 7 counts are those that `--method pair` searches."""
+    done = run(porto, "-o", tmp_path, "--queries", 1, "--work-limit", 0.1, "--only", "figure7")
+    assert done.returncode == 0, done.stderr
+    counted = sum(of_type["tuples"] for of_type in json.loads((tmp_path / "figure7.json").read_text())["types"])
+    match, searched = methods.match_pairs, []
+    monkeypatch.setattr(methods, "match_pairs", lambda *given: (searched.append(len(given[1])), match(*given))[1])
+    area = open_reference(tmp_path / "work" / "porto-10km.gpkg")
+    locate(str(MASKS["drone"].path), area, LocateOptions(method="pair"))
+    assert searched == [counted]
 
 
 def test_the_tables_are_made_of_all_tiles(town, data_dir, tmp_path):
