@@ -48,6 +48,7 @@ CAMERA, PAIR, TANGENT, SERVE = CameraOptions(), PairOptions(), IntersectionOptio
 NEARBY, CHECK = LocalSearchOptions(), checking.CheckOptions()
 NEEDED = LocateOptions().min_log10_odds
 SECTION_8 = "docs/how-it-works.md"
+MARGIN_M = sharding.ShardOptions().margin_m
 MIB, GIB = 1 << 20, 1 << 30
 
 
@@ -180,6 +181,7 @@ FROM_CODE = [
         r"gets (\d+) GiB of memory and (\w+) minutes for a tile",
         (onnx_file._MAX_MEMORY / GIB, onnx_file._MAX_SECONDS / 60.0),
     ),
+    ("docs/qgis.md", r"residuals × (\d+)\*", location_layers._EXAGGERATION),
     ("docs/qgis.md", r"are drawn (\d+) times as long", location_layers._EXAGGERATION),
     ("docs/references.md", r"kept for (\d+) days", overpass._MOST_AGE_S / 86400.0),
     (
@@ -189,7 +191,8 @@ FROM_CODE = [
     ),
     ("docs/references.md", r"pieces of some ([\d,]+) straight", sharding._SEGMENTS),
     ("docs/references.md", r"not smaller than (\d+) km\)", sharding._CELL_M / 1000.0),
-    ("docs/references.md", r"neighbours share. (\d+) km by default", sharding.ShardOptions().margin_m / 1000.0),
+    ("docs/references.md", r"neighbours share. (\d+) km by default", MARGIN_M / 1000.0),
+    ("docs/references.md", r"enough for (\d+) pixels of ([\d.]+) m", (1500, round(MARGIN_M / 750.0 / 2.0**0.5, 1))),
     (
         "docs/references.md",
         r"Images of (\d+) to (\d+) m pixels",

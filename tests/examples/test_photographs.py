@@ -1,14 +1,18 @@
 """`examples/photographs`: the photograph of the demonstration in each mode, and the counts."""
 
+import csv
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.documents import said, value
 
 from roadgeo.evaluation.demo import ROADS, STREETS
+from roadgeo.matching.options import LocateOptions
 
+NEEDED = LocateOptions().min_log10_odds
 PHOTOGRAPHS = Path(__file__).parents[2] / "examples" / "photographs" / "photographs.py"
 TRUTH = """file,label,lon,lat,gsd_m,heading_deg,kind,roads
 berkeley_photo.jpg,,-122.2593,37.8717,0.9426,0,NAIP,berkeley_streets.gpkg
@@ -33,11 +37,17 @@ def test_a_photograph_is_searched_once_in_each_mode(tmp_path: Path) -> None:
     (folder / "truth.csv").write_text(TRUTH)
     for path in (STREETS, STREETS.with_name("berkeley_photo.jpg")):
         shutil.copy(path, tmp_path if path == STREETS else folder)
+    run(tmp_path, "blind", folder)
     run(tmp_path, "told", folder)
     run(tmp_path, "elsewhere", folder, "--maps", ROADS, tmp_path / STREETS.name)
     counted = run(tmp_path, "told", folder)  # nothing is searched again
     assert "| told | 1 of 1 (3 to 100 %) | 0 of 1 (0 to 98 %) |" in counted
     assert "| elsewhere | - | 0 of 1 (0 to 98 %) |" in counted
+    with (tmp_path / "results.csv").open(newline="") as file:
+        blind = next(row for row in csv.DictReader(file) if row["mode"] == "blind")
+    assert (float(blind["score"]), NEEDED) == pytest.approx(
+        [value(text) for text in said("README.md", r"\(here ([\d.]+); ([\d.]+) are needed\)")], abs=0.05
+    )
 
 
 def test_counts_of_the_kept_results_are_printed(tmp_path: Path) -> None:
