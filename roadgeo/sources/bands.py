@@ -15,7 +15,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import are_labels, are_patches, are_roads
-from roadgeo.storage.rasters import open_raster, page_of, sidecar_nodata
+from roadgeo.storage.rasters import open_raster, page_of, read_palette, sidecar_nodata
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -191,10 +191,9 @@ def _model_threshold(dataset: DatasetReader) -> float | None:
 
 def _palette(dataset: DatasetReader, band: int) -> AnyArray | None:
     """Return the (256, 4) colours that values stand for; None where the values mean what they are, as classes do."""
-    if dataset.dtypes[band - 1] != "uint8" or dataset.colorinterp[band - 1].name != "palette":
+    palette = read_palette(dataset, band, 4) if dataset.dtypes[band - 1] == "uint8" else None
+    if palette is None:
         return None
-    colours = dataset.colormap(band)
-    palette = np.array([colours.get(value, (0, 0, 0, 255)) for value in range(256)], np.uint8)
     values = dataset.read(band)
     used = np.unique(values)
     shown = palette[used, :3]

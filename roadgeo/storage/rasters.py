@@ -59,8 +59,9 @@ MAX_SIDE = 60_000
 #: An axis of an array no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
 
-#: First bytes of the formats that are read, and GDAL's names of their drivers.
+#: First bytes of the formats that are read, and GDAL's names of their drivers, where it has one.
 _DRIVERS = (
+    (rb"\x93NUMPY", "NumPy"),
     (rb"II[*+]\0|MM\0[*+]", "GTiff"),
     (rb"\x89PNG\r\n\x1a\n", "PNG"),
     (rb"\xff\xd8\xff", "JPEG"),
@@ -77,7 +78,6 @@ _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine, .np
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
 _MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
-_ARRAY = b"\x93NUMPY"
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
@@ -125,17 +125,11 @@ def open_raster(
     remote = is_named_remote(path)
     page = _PAGE.fullmatch(os.fspath(path)) if isinstance(path, str) else None
     path = page[2] if page else path
-    if not remote:
-        require_file(path, name)
-        if _is_array(path):
-            with warnings.catch_warnings(), _opened_array(path, name) as dataset:
-                yield dataset
-            return
     if remote:
-        drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
+        drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[1:-1]]
     else:
+        require_file(path, name)
         drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * (is_ours or is_inside()))
-    if not remote:
         if drivers == ["JP2OpenJPEG"]:
             _require_boxes(Path(path), name)
         if drivers == ["PNG"]:
@@ -144,6 +138,10 @@ def open_raster(
             raise MaskError(f"{name}: holds no pages; only TIFFs do: leave --page out")
         if drivers == ["GTiff"] and not page and (number := _first_whole_page(Path(path))) > 1:
             page = _PAGE.fullmatch(name_page(os.fspath(path), number))
+    if drivers == ["NumPy"]:
+        with warnings.catch_warnings(), _opened_array(path, name) as dataset:
+            yield dataset
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
@@ -236,12 +234,12 @@ def require_file(path: str | os.PathLike[str], name: str) -> None:
         raise MaskError(f"{name}: is a pipe or device; expected a regular file: save the raster first")
 
 
-def read_palette(dataset: DatasetReader) -> AnyArray | None:
-    """Return the colours that the values of a raster's first band stand for, (256, 3) RGB; None where they do not."""
-    if dataset.colorinterp[0].name != "palette":
+def read_palette(dataset: DatasetReader, band: int = 1, channels: int = 3) -> AnyArray | None:
+    """Return the colours that the values of a band stand for, (256, 3) RGB or (256, 4) RGBA; None where they do not."""
+    if dataset.colorinterp[band - 1].name != "palette":
         return None
-    colors = dataset.colormap(1)
-    return np.array([colors.get(i, (0, 0, 0))[:3] for i in range(256)], np.uint8)
+    colors = dataset.colormap(band)
+    return np.array([colors.get(i, (0, 0, 0, 255))[:channels] for i in range(256)], np.uint8)
 
 
 def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
@@ -263,8 +261,12 @@ _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jp2", ".bmp", ".
 def is_raster(path: str | os.PathLike[str]) -> bool:
     """Whether a file begins as a format that is read here."""
     with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-        head = file.read(_HEAD_BYTES)
-    return head.startswith(_ARRAY) or any(re.match(magic, head, re.DOTALL) for magic, _ in _DRIVERS)
+        return _driver_of(file.read(_HEAD_BYTES)) is not None
+
+
+def _driver_of(head: bytes) -> str | None:
+    """Return the driver for a file that begins so."""
+    return next((driver for magic, driver in _DRIVERS if re.match(magic, head, re.DOTALL)), None)
 
 
 def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
@@ -273,7 +275,7 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
         head = file.read(_HEAD_BYTES)
     if not head:
         raise MaskError(f"{name}: is empty; copy or export it again")
-    driver = next((driver for magic, driver in _DRIVERS if re.match(magic, head, re.DOTALL)), None)
+    driver = _driver_of(head)
     if driver == "VRT" and "VRT" not in more:
         raise MaskError(
             f"{name}: a GDAL virtual raster, which names other files to read: give those, "
@@ -384,11 +386,6 @@ def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetRead
             with dataset:
                 yield dataset
             return
-
-
-def _is_array(path: str | os.PathLike[str]) -> bool:
-    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-        return file.read(len(_ARRAY)) == _ARRAY
 
 
 @contextmanager
