@@ -15,6 +15,7 @@ __all__ = [
     "OWN_SHIFT",
     "SEALED",
     "allowed_drivers",
+    "are_skipped",
     "forget_missing_proj_data",
     "is_named_remote",
     "skip_drivers",
@@ -41,7 +42,7 @@ SEALED = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", **OWN_SHIFT, **NETWORK}
 
 
 def skip_drivers() -> None:
-    """Have GDAL leave out its dangerous drivers, for programs that are roadgeo's alone: call it before GDAL is loaded.
+    """Have GDAL leave out its dangerous drivers, in commands and inside the fence: call it before GDAL is loaded.
 
     Programs that merely use roadgeo keep their drivers; `storage.rasters` and `storage.vectors` guard each file.
     """
@@ -50,6 +51,14 @@ def skip_drivers() -> None:
     kept = set(allowed_drivers())
     names = dict.fromkeys(name for name in (*before, *_SKIPPED) if name and name not in kept)
     os.environ["GDAL_SKIP"] = ",".join(names)
+
+
+def are_skipped() -> bool:
+    """Whether rasterio's GDAL lacks its dangerous drivers: it takes any for the files that a virtual raster names."""
+    import rasterio
+
+    with rasterio.Env() as env:
+        return not env.drivers().keys() & {*_SKIPPED} - {*allowed_drivers()}
 
 
 def forget_missing_proj_data() -> None:

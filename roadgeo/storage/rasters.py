@@ -25,7 +25,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.fence import is_inside, remedy
-from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
+from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, is_named_remote
 from roadgeo.storage.orientation import (
     UPRIGHT,
     read_orientation,
@@ -129,7 +129,7 @@ def open_raster(
         drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[1:-1]]
     else:
         require_file(path, name)
-        drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * (is_ours or is_inside()))
+        drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
         if drivers == ["JP2OpenJPEG"]:
             _require_boxes(Path(path), name)
         if drivers == ["PNG"]:
@@ -276,7 +276,7 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
     if not head:
         raise MaskError(f"{name}: is empty; copy or export it again")
     driver = _driver_of(head)
-    if driver == "VRT" and "VRT" not in more:
+    if driver == "VRT" and "VRT" not in more and not (is_inside() and are_skipped()):
         raise MaskError(
             f"{name}: a GDAL virtual raster, which names other files to read: give those, "
             f"or set {CONSENT}=VRT if you trust it"

@@ -13,7 +13,7 @@ import click
 import pytest
 import rasterio
 from worlds.demo import DRONE
-from worlds.hostile import MAPS, MASKS, naming, virtual
+from worlds.hostile import MAPS, MASKS, mrf, naming, virtual
 
 from roadgeo import plugins
 from roadgeo.cli import cli
@@ -117,6 +117,43 @@ def test_a_virtual_raster_reads_what_it_names_where_that_is_allowed(porto: Path,
     assert refused.stderr.count("\n") == 1
     assert "--allow" in refused.stderr
     assert roadgeo(tmp_path, "locate", "mask.vrt", "-r", str(porto), "--allow", "tiles").returncode == 0
+
+
+VIRTUAL = """
+import sys
+import roadgeo
+from roadgeo.errors import MaskError
+from roadgeo.sources.masks import read_mask
+if sys.argv[2] == "loaded":
+    import rasterio
+    rasterio.Env().__enter__()
+assert roadgeo.fence(sys.argv[1])
+try:
+    read_mask(f"{sys.argv[1]}/mask.vrt")
+except MaskError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("gdal", ["loaded", "not loaded"])
+def test_what_a_virtual_raster_names_writes_nothing_where_machine_code_is_kept(tmp_path: Path, gdal: str) -> None:
+    """The cache may be written inside the fence, and GDAL has a driver that writes where a file says."""
+    (tmp_path / "cache").mkdir(mode=0o700)
+    (tmp_path / "given").mkdir()
+    virtual(tmp_path / "given", str(mrf(tmp_path / "given", tmp_path / "cache" / "planted")))
+    command = [sys.executable, "-c", VIRTUAL, str(tmp_path / "given"), gdal]
+    environment = {name: value for name, value in os.environ.items() if name != "GDAL_SKIP"}
+    environment |= {"ROADGEO_CACHE": str(tmp_path / "cache"), "ROADGEO_LIBRARY": str(tmp_path / "library")}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+    assert not (tmp_path / "cache" / "planted").exists()
+    assert ("virtual raster" if gdal == "loaded" else "not recognized") in done.stdout
+
+
+def test_what_is_no_raster_is_named_inside_too(tmp_path: Path) -> None:
+    (tmp_path / "mask.png").write_text("no picture")
+    (tmp_path / "mask.nc").write_bytes(b"CDF\1" + bytes(100))
+    for name, message in (("mask.png", "is text, whatever its name says"), ("mask.nc", "not a raster of a format")):
+        assert message in roadgeo(tmp_path, "vectorize", name).stderr
 
 
 def test_a_reference_in_another_folder_gets_its_index_there(porto: Path, tmp_path: Path) -> None:

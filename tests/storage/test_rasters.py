@@ -17,6 +17,7 @@ import pytest
 import rasterio
 import rasterio.control
 from support.loopback import counting_server
+from worlds.hostile import mrf
 from worlds.pngs import png
 from worlds.rasters import write_raster
 from worlds.turned import mark_turned, save_turned
@@ -52,16 +53,6 @@ def victim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def mrf(folder: Path, victim: Path) -> str:
-    """Return the text of an MRF whose cache is another file: whoever reads it writes there."""
-    source = write_raster(folder / "source.tif", np.full((64, 64), ord("X"), np.uint8))
-    return (
-        f"<MRF_META><CachedSource><Source>{source}</Source></CachedSource><Raster>"
-        '<Size x="64" y="64" c="1"/><PageSize x="64" y="64" c="1"/><Compression>NONE</Compression>'
-        f"<DataType>Byte</DataType><DataFile>{victim}</DataFile><IndexFile>{folder}/i.idx</IndexFile></Raster></MRF_META>"
-    )
-
-
 def vrt(source: object) -> str:
     return (
         '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
@@ -89,7 +80,7 @@ class TestNothingIsWritten:
     )
     def test_by_a_file_of_another_format(self, tmp_path, victim, read, name, content, message):
         inner, path = tmp_path / "inner.bin", tmp_path / name
-        inner.write_text(mrf(tmp_path, victim))
+        inner.write_text(mrf(tmp_path, victim).read_text())
         path.write_text(content.format(mrf=inner.read_text(), vrt=vrt(inner)))
         with pytest.raises(MaskError, match=message):
             read(path)
@@ -98,14 +89,14 @@ class TestNothingIsWritten:
     @pytest.mark.parametrize("sibling", [".ovr", ".msk", ".aux.xml"])
     def test_by_a_sibling(self, tmp_path, victim, roads, read, sibling):
         path = write_raster(tmp_path / "mask.tif", roads)
-        Path(f"{path}{sibling}").write_text(mrf(tmp_path, victim))
+        Path(f"{path}{sibling}").write_text(mrf(tmp_path, victim).read_text())
         read_or_miss(read, path)
         assert victim.read_text() == "safe"
 
     @pytest.mark.parametrize("inside", [True, False])
     def test_by_overviews_that_metadata_name(self, tmp_path, victim, roads, read, inside):
         path, evil = tmp_path / "mask.tif", tmp_path / "evil"
-        evil.write_text(mrf(tmp_path, victim))
+        evil.write_text(mrf(tmp_path, victim).read_text())
         write_raster(path, roads)
         if inside:
             with rasterio.open(path, "r+") as sink:
@@ -122,7 +113,7 @@ class TestNothingIsWritten:
 def test_the_exploit_works_where_gdal_is_free(tmp_path, victim):
     """Else the tests above prove nothing."""
     path = tmp_path / "mask.png"
-    path.write_text(mrf(tmp_path, victim))
+    path.write_text(mrf(tmp_path, victim).read_text())
     # In a process of its own: a command that other tests ran here has already shut the drivers out.
     free = {name: value for name, value in os.environ.items() if not name.startswith("GDAL_")}
     code = "import sys, rasterio; rasterio.open(sys.argv[1]).read(1)"

@@ -14,7 +14,7 @@ import pyproj
 import rasterio
 import shapely
 
-__all__ = ["MAPS", "MASKS", "naming"]
+__all__ = ["MAPS", "MASKS", "mrf", "naming", "virtual"]
 
 LINES = [shapely.LineString([(5e5, 4.5e6), (501000, 4501000)]), shapely.LineString([(5e5, 4501000), (501000, 4500000)])]
 GEOGCS = (
@@ -211,6 +211,19 @@ def virtual(folder: Path, file: str) -> Path:
         f'<SourceFilename relativeToVRT="0">{file}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>'
     )
     return folder / "mask.vrt"
+
+
+def mrf(folder: Path, victim: Path) -> Path:
+    """Write an MRF whose cache is another file: whoever reads it writes there."""
+    place = rasterio.Affine(1, 0, 5e5, 0, -1, 4.5e6)
+    with rasterio.open(folder / "source.tif", "w", "GTiff", 64, 64, 1, dtype="uint8", transform=place) as raster:
+        raster.write(np.full((64, 64), ord("X"), np.uint8), 1)
+    (folder / "inner.mrf").write_text(
+        f"<MRF_META><CachedSource><Source>{folder}/source.tif</Source></CachedSource><Raster>"
+        '<Size x="64" y="64" c="1"/><PageSize x="64" y="64" c="1"/><Compression>NONE</Compression>'
+        f"<DataType>Byte</DataType><DataFile>{victim}</DataFile><IndexFile>{victim}.idx</IndexFile></Raster></MRF_META>"
+    )
+    return folder / "inner.mrf"
 
 
 MASKS: list[Callable[[Path, str], Path]] = [tiff, imagine, virtual]
