@@ -147,7 +147,9 @@ def open_raster(
         try:
             # Absolute, for a name may look like the text of a virtual raster, which GDAL takes in place of a path.
             where = os.fspath(path) if remote else str(Path(path).absolute())
-            with _opened(f"GTIFF_DIR:{page[1]}:{where}" if page else where, drivers, remote) as dataset:
+            # What a virtual raster of a stranger names is read inside the fence, but not fetched.
+            may_fetch = remote or (drivers == ["VRT"] and (is_ours or "VRT" in allowed_drivers()))
+            with _opened(f"GTIFF_DIR:{page[1]}:{where}" if page else where, drivers, may_fetch) as dataset:
                 _require_plain(dataset, name)
                 orientation = _orientation(dataset, path, remote) if upright else UPRIGHT
                 if orientation == UPRIGHT:
@@ -366,12 +368,11 @@ def _require_chunks(path: Path, name: str) -> None:
 
 
 @contextmanager
-def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetReader]:
+def _opened(path: str, drivers: list[str], may_fetch: bool) -> Iterator[DatasetReader]:
     """Open a dataset with the first of some drivers that takes it."""
     import rasterio
     from rasterio.errors import RasterioIOError
 
-    may_fetch = remote or drivers == ["VRT"]
     with rasterio.Env(
         GDAL_CACHEMAX=_CACHE_BYTES,
         **{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)},

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import pytest
 import rasterio
+from support.loopback import counting_server
 from worlds.demo import DRONE
 from worlds.hostile import MAPS, MASKS, mrf, naming, virtual
 
@@ -147,6 +148,17 @@ def test_what_a_virtual_raster_names_writes_nothing_where_machine_code_is_kept(t
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
     assert not (tmp_path / "cache" / "planted").exists()
     assert ("virtual raster" if gdal == "loaded" else "not recognized") in done.stdout
+
+
+def test_a_virtual_raster_fetches_nothing_where_connections_are_made(tmp_path: Path) -> None:
+    """As in a command that asks a server, or where the system cannot forbid connections."""
+    (tmp_path / "given").mkdir()
+    with counting_server() as (address, asked):
+        virtual(tmp_path / "given", f"/vsicurl/{address}/a.tif")
+        code = VIRTUAL.replace("sys.argv[1])", "sys.argv[1], network=True)")
+        command = [sys.executable, "-c", code, str(tmp_path / "given"), "not loaded"]
+        subprocess.run(command, env=surroundings(tmp_path), capture_output=True, check=True, timeout=120)
+    assert asked == []
 
 
 def test_what_is_no_raster_is_named_inside_too(tmp_path: Path) -> None:
