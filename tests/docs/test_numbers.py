@@ -236,7 +236,11 @@ FROM_CODE = [
     ("docs/paper.md", r"`delta_angle_deg` = (\d+)", PAIR.delta_angle_deg),
     ("docs/paper.md", r"`d_max_m` = ([\d,]+)", PAIR.d_max_m),
     ("docs/paper.md", r"`inlier_distance_m` = (\d+)", PAIR.inlier_distance_m),
-    ("docs/paper.md", r"as stated, ([\d.]+), of at least `min_intersections` = (\d+)", (PAIR.delta_inlier, 30)),
+    (
+        "docs/paper.md",
+        r"as stated, ([\d.]+), of at least `min_intersections` = (\d+)",
+        (PAIR.delta_inlier, PAIR.min_intersections),
+    ),
     (
         "docs/paper.md",
         r"`lambda` = ([\d.]+), `lambda_1` = ([\d.]+) and `p_query` = ([\d.]+)",
