@@ -220,17 +220,23 @@ def _spread(values: AnyArray, first: float) -> tuple[float, ...]:
 def _refuse_classes(sample: Sample, levels: AnyArray) -> None:
     """Raise where small whole numbers are the classes of a map and not a faint map, whose neighbours differ by one."""
     rows = sample.read_rows().astype(np.float64)
-    steps = np.abs(np.concatenate([np.diff(rows, axis=0).ravel(), np.diff(rows, axis=1).ravel()]))
+    pairs = ((rows[1:], rows[:-1]), (rows[:, 1:], rows[:, :-1]))
+    steps = np.concatenate([np.abs(one - other).ravel() for one, other in pairs])
+    upper = np.concatenate([np.maximum(one, other).ravel() for one, other in pairs])[steps > 0]
     steps = steps[steps > 0]
     filled = len(levels) / (levels[-1] - levels[0] + 1)
     if filled >= _MIN_LEVELS_FILLED:
-        if len(steps) and np.mean(steps == 1) >= _MIN_STEPS_OF_ONE:
+        if len(steps) and min(np.mean(steps[upper == level] == 1) for level in np.unique(upper)) >= _MIN_STEPS_OF_ONE:
             return
         if len(levels) >= _MANY_LEVELS and _shows_roads(rows, _otsu(rows.ravel())):
             return
+    raise _several_classes(sample, levels)
+
+
+def _several_classes(sample: Sample, levels: AnyArray) -> MaskError:
     listed = ", ".join(f"{level:g}" for level in levels)
     what = f"{sample.name}: holds the classes {listed}; expected road and no road"
-    raise MaskError(f"{what}: give the one that is road with --class N, or a threshold")
+    return MaskError(f"{what}: give the one that is road with --class N, or a threshold")
 
 
 def _is_dark_photograph(sample: Sample, levels: AnyArray) -> bool:
@@ -315,6 +321,13 @@ def _grey_share(sample: Sample, values: AnyArray) -> float:
         off <= _CRISP_SHARE or _shows_roads(sample.read_rows().astype(np.float64), _otsu(values))
     ):
         return off
+    rows = sample.read_rows()
+    if (
+        coloured <= _COLOURED_SHARE
+        and len(sample.levels) <= _MAX_CLASS
+        and are_patches(rows, np.full(rows.shape, True))
+    ):
+        raise _several_classes(sample, sample.levels)
     raise PhotographError(
         f"{sample.name}: looks like a photograph, {coloured:.0%} of it coloured and {off:.0%} neither dark nor light; "
         "expected a mask of its roads: segment it first (or give a threshold, if it is a mask)"

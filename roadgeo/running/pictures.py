@@ -169,7 +169,7 @@ def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
     """Mask transparent pixels; of black drawn on transparent ground the alpha itself shows the roads."""
     if not values[alpha > 0].any():
         return alpha
-    hidden = np.repeat((alpha == 0)[..., None], values.shape[2], axis=2)
+    hidden = np.repeat((alpha <= alpha.max() // 2)[..., None], values.shape[2], axis=2)  # edges may be smoothed
     masked: AnyArray = np.ma.masked_array(values, hidden)
     return masked
 

@@ -28,6 +28,7 @@ PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
 _MAX_CLASSES = 32  # whose colours a palette holds
 _MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _MOST_LISTED = 8
+_MIDDLE_PIXELS = 1 << 22  # by which alpha is judged
 
 #: Words for roads in names of bands, and words for properties of roads, or for all else.
 _ROADS = re.compile(r"\b(?:road|street|highway|stra(?:ss|ß)e|route|estrada|carreter|calle|strad[ae])[^\W\d]*", re.I)
@@ -157,13 +158,15 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
         raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
     palette = _palette(dataset, colour[0]) if len(colour) == 1 and choice.road_class is None else None
-    all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
+    flags = list(dataset.mask_flag_enums)[chosen[0] - 1]
+    all_valid = MaskFlags.all_valid in flags
+    least = _half_opaque(dataset, chosen[0]) if MaskFlags.alpha in flags else 0
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
         window = Window(0, top, dataset.width, bottom - top)
         # Every step-th value of all, for to read fewer GDAL would go to overviews: blurred, or of another file.
         values = np.moveaxis(dataset.read(chosen, window=window)[:, ::step, ::step], 0, 2)
-        valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > 0
+        valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > least
         if nodata is not None and dataset.nodata is None:
             given = (values != nodata).all(axis=2)
             valid = given if valid is None else valid & given
@@ -176,6 +179,15 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
     size, own = (dataset.height, dataset.width), _model_threshold(dataset)
     return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page_of(dataset), own)
+
+
+def _half_opaque(dataset: DatasetReader, band: int) -> int:
+    """Return half of the greatest alpha in the middle rows: where less shows, edges were smoothed."""
+    from rasterio.windows import Window
+
+    rows = min(dataset.height, max(_MIDDLE_PIXELS // dataset.width, 1))
+    window = Window(0, (dataset.height - rows) // 2, dataset.width, rows)
+    return int(dataset.read_masks(band, window=window).max()) // 2
 
 
 def _model_threshold(dataset: DatasetReader) -> float | None:

@@ -43,6 +43,9 @@ _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are inte
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _MAX_ROAD_SHARE = 0.35  # of a frame
 _MOST_LISTED = 8
+#: Drawings in two colours, smooth or as JPEG: share of the variance along one line of colours, of pixels beyond either
+#: end, how far from an end of 0 to 255 a colour counts as pure, and most mixed pixels for each of the rarer end.
+_ON_A_LINE, _END, _PURE, _MOST_MIXED = 0.97, 0.002, 38, 1.5
 _MANY_VALUES = 9  # beside a fill that no file declares
 
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
@@ -188,7 +191,7 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
     if choice.road_class is not None:
         raster = _of_class(raster, choice.road_class)
     observed, hidden = _sample(raster)
-    plain = _of_colours(_without_fill(raster, observed))
+    plain = _of_colours(_of_two_colours(_without_fill(raster, observed), observed))
     if plain is not raster:
         raster = plain
         observed, hidden = _sample(raster)
@@ -292,6 +295,30 @@ def _without_fill(raster: Bands, observed: AnyArray) -> Bands:
             _LOG.warning("%s: its value %g, far from all others, is taken for not observed", visible(raster.name), end)
             return _changed(raster, partial(_all_but, end))
     return raster
+
+
+def _of_two_colours(raster: Bands, observed: AnyArray) -> Bands:
+    """Take how much of the lighter of two colours each pixel has, where all are mixtures, as smooth edges and JPEG are.
+
+    (n, B) values of a sample were observed.
+    """
+    if observed.shape[1] != 3 or observed.dtype.kind not in "iu" or not np.ptp(observed, axis=1).any():
+        return raster
+    parts, axes = np.linalg.eigh(np.cov(observed.T.astype(np.float64)))
+    axis = axes[:, -1] * (1.0 if axes[:, -1].sum() >= 0.0 else -1.0)
+    low, high = np.quantile(observed @ axis, [_END, 1.0 - _END])
+    if high <= low or parts[-1] < _ON_A_LINE * parts.sum():
+        return raster
+
+    def share(values: AnyArray) -> AnyArray:
+        shares: AnyArray = np.clip((values @ axis - low) / (high - low), 0.0, 1.0)
+        return np.rint(255.0 * shares).astype(np.uint8)
+
+    sampled = share(observed)
+    dark, light = np.mean(sampled < _PURE), np.mean(sampled > 255 - _PURE)
+    if 1.0 - dark - light > _MOST_MIXED * min(dark, light):
+        return raster
+    return replace(_changed(raster, lambda values, valid: (share(values)[..., None], valid)), bands=raster.bands[:1])
 
 
 def _of_colours(raster: Bands) -> Bands:

@@ -12,6 +12,7 @@ import rasterio
 from worlds.rasters import write_raster
 
 from roadgeo.errors import MaskError, PhotographError
+from roadgeo.running.pictures import read_picture
 from roadgeo.sources.bands import Choice
 from roadgeo.sources.masks import open_mask, read_mask
 
@@ -111,6 +112,62 @@ def test_two_colours_are_road_and_no_road(
     path = tmp_path / "drawing.png"
     cv2.imwrite(str(path), np.array([dark, light], np.uint8)[roads.astype(int)])
     np.testing.assert_array_equal(read_mask(path).roads, roads)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", "array"])
+@pytest.mark.parametrize(
+    ("ground", "road"),
+    [
+        ((0, 0, 0), (255, 0, 0)),
+        ((255, 255, 255), (255, 0, 0)),
+        ((255, 255, 255), (255, 255, 0)),
+        ((0, 120, 0), (255, 0, 0)),
+        ((68, 1, 84), (253, 231, 37)),
+    ],
+)
+def test_mixtures_of_two_colours_are_smooth_edges(
+    tmp_path: Path, roads: np.ndarray, ground: tuple[int, ...], road: tuple[int, ...], ending: str
+) -> None:
+    shares = cv2.GaussianBlur(np.kron(roads, np.ones((4, 4))), (0, 0), 1.0)[..., None]
+    drawing = np.rint(shares * road + (1 - shares) * ground).astype(np.uint8)
+    if ending != "array":
+        PIL.Image.fromarray(drawing).save(tmp_path / f"a{ending}", quality=75)
+    found = read_mask(drawing if ending == "array" else tmp_path / f"a{ending}", voids=False).roads
+    assert np.mean(found == (shares[..., 0] > 0.5)) > 0.99
+
+
+@pytest.mark.parametrize("library", ["file", "PIL"])
+@pytest.mark.parametrize("colour", [(255, 0, 0), (255, 255, 255), (0, 0, 0)])
+def test_smooth_edges_of_alpha_do_not_widen_roads(
+    tmp_path: Path, roads: np.ndarray, colour: tuple[int, ...], library: str
+) -> None:
+    shares = cv2.GaussianBlur(np.kron(roads, np.ones((4, 4))), (0, 0), 3.0)
+    alpha = np.rint(200 * shares).astype(np.uint8)
+    drawing = np.dstack([np.full((*alpha.shape, 3), colour, np.uint8), alpha])
+    PIL.Image.fromarray(drawing).save(tmp_path / "a.png")
+    source = tmp_path / "a.png" if library == "file" else read_picture(PIL.Image.open(tmp_path / "a.png"))
+    found = read_mask(source, voids=False).roads
+    assert found.sum() == pytest.approx((shares > 0.5).sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("others", [2, 3, 127])
+@pytest.mark.parametrize("kind", [np.uint8, np.int32, "palette"])
+def test_classes_beside_roads_are_asked_for(tmp_path: Path, roads: np.ndarray, others: int, kind: object) -> None:
+    """What is numbered next to roads, such as buildings, is no fainter or surer road."""
+    houses = (
+        ((ROWS // 12) % 2 == 1)
+        & ((COLUMNS // 12) % 3 == 1)
+        & ~cv2.dilate(roads.astype(np.uint8), PATCH[:5, :5]).astype(bool)
+    )
+    road = 255 if others == 127 else 1
+    values = np.where(roads, road, np.where(houses, others, 0))
+    source = values.astype(np.uint8 if kind == "palette" else kind)
+    if kind == "palette":
+        source = write_raster(tmp_path / "a.tif", source, colors={k: (k, 90, 255 - k, 255) for k in range(256)})
+    with pytest.raises(MaskError, match=r"holds the classes 0, .*--class N"):
+        read_mask(source)
+    with open_mask(source, choice=Choice(road_class=road)) as mask:
+        np.testing.assert_array_equal(mask.read(mask.thresholds[0]).roads, roads)
 
 
 def test_a_palette(tmp_path: Path, roads: np.ndarray) -> None:
