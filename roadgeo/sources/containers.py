@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,11 +23,12 @@ from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_way
 from roadgeo.sources.schemas import is_filled, is_known_column, names_kinds
 from roadgeo.storage.memory import each_bounded
 from roadgeo.storage.unpacking import read_chunks
-from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
+from roadgeo.storage.vectors import beside, describe_layer, first_line, list_layers, read_layer
 
 __all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_missing"]
 
 _PARQUET = (".parquet", ".geoparquet", ".pq")
+_PARQUET_MAGIC = b"PAR1"
 _GRAPHS = (".graphml",)
 _GDAL = (
     ".gpkg", ".shp", ".geojson", ".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl", ".topojson", ".fgb",
@@ -118,7 +120,7 @@ def _stream(
         tables = stream_ways(path, most, advance, folder)
     elif name.endswith(_GRAPHS):
         tables = iter([_read_graphml(path)])
-    elif name.endswith(_PARQUET):
+    elif name.endswith(_PARQUET) or (path.is_file() and _ends(path, 4) == (_PARQUET_MAGIC,) * 2):
         tables = _stream_parquet(path, most, advance)
     elif name.endswith(".json") and (elements := _overpass_elements(path)) is not None:
         tables = iter([overpass_table(elements)])
@@ -285,6 +287,10 @@ def _what_is_wrong(path: Path) -> str:
         return "is empty; copy or export it again"
     if came := _IN_PLACE.match(head):
         return "is a web page; fetch the file itself" if came[1] else "is a pointer of Git LFS; fetch it (git lfs pull)"
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "is text in UTF-16; save it in UTF-8"
+    if ending == ".shp" and _has_cut_table(path):
+        return "its .dbf is cut off; copy or export it again"
     root = _ROOT.match(head) if ending in (".gml", ".gpx", ".kml") else None
     is_cut = (
         has_open_text
@@ -293,6 +299,15 @@ def _what_is_wrong(path: Path) -> str:
         or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
     )
     return f"is cut off after {size:,} bytes; copy or export it again" if is_cut else ""
+
+
+def _has_cut_table(path: Path) -> bool:
+    """Whether the .dbf beside a shapefile is shorter than its rows."""
+    table = next((file for file in beside(path) if file.suffix.lower() == ".dbf"), None)
+    if table is None:
+        return False
+    rows, start, wide = struct.unpack("<IHH", _ends(table, 12)[0][4:].ljust(8, b"\xff"))
+    return bool(table.stat().st_size < start + rows * wide)
 
 
 def _ends(path: Path, n: int) -> tuple[bytes, bytes]:
@@ -331,7 +346,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
     try:
         with pq.ParquetFile(path) as file:
             _require_rows(file.metadata.num_rows, path.stat().st_size)
-            shape_column, crs, encoding = _declared(file.schema_arrow) or _named_shapes(file.schema_arrow)
+            shape_column, crs, encoding = _declared(file.schema_arrow) or _shapes_by_values(file)
             names = [name for name in file.schema_arrow.names if name != shape_column]
             leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
         wanted = [name for name in names if is_known_column(name)] or names
@@ -373,13 +388,15 @@ def _declared(schema: Any) -> tuple[str, Any, str] | None:
     return None
 
 
-def _named_shapes(schema: Any) -> tuple[str, None, str]:
-    """Return the column that is named as one with shapes; the rest as `_declared` does."""
-    for field in schema:
-        kind = str(field.type).removeprefix("large_").removesuffix("_view")
-        if field.name.lower() in _SHAPES and kind in _TEXTS:
-            return field.name, None, "WKB"
-    raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
+def _shapes_by_values(file: Any) -> tuple[str, None, str]:
+    """Return the column of a Parquet file that holds shapes by its first values; the rest as `_declared` does."""
+    kinds = {field.name: str(field.type).removeprefix("large_").removesuffix("_view") for field in file.schema_arrow}
+    names = [name for name, kind in kinds.items() if kind in _TEXTS]
+    first = next(file.iter_batches(_PEEK, columns=names), None) if names else None
+    columns = {} if first is None else {name: objects(first[name].to_pylist()) for name in names}
+    if _take_shapes(columns) is None:
+        raise ValueError("it declares no geometry column, and none holds WKB or WKT")
+    return next(name for name in names if name not in columns), None, "WKB"
 
 
 def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:

@@ -276,13 +276,23 @@ def _tag(values: AnyArray, key: str) -> AnyArray:
     return _each(values, find)
 
 
-def _rules(value: Any) -> list[tuple[Any, list[str]]]:
+def _rules(value: Any) -> list[tuple[tuple[float, float] | None, list[str]]]:
     """Return Overture's flags of a segment: each with the part that it holds for, two shares of its length, or None."""
     rules, lists = _json(value), list | tuple | np.ndarray
     mappings = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
     return [
-        (rule.get("between"), [*map(str, flags)]) for rule in mappings if isinstance(flags := rule.get("values"), lists)
+        (_span(rule.get("between")), [*map(str, flags)])
+        for rule in mappings
+        if isinstance(flags := rule.get("values"), lists)
     ]
+
+
+def _span(part: Any) -> tuple[float, float] | None:
+    """Return two shares of a length, the lesser first; a missing one is that of an end. None: they are no pair."""
+    if not isinstance(part, list | tuple | np.ndarray) or len(part) != 2:
+        return None
+    ends = [float(end) if is_filled(end) else default for end, default in zip(part, (0.0, 1.0), strict=True)]
+    return min(max(min(ends), 0.0), 1.0), min(max(*ends, 0.0), 1.0)
 
 
 def _flags(value: Any) -> list[str]:
@@ -301,7 +311,7 @@ def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, Boo
         if not parts or not isinstance(shape, shapely.LineString):
             pieces.append((shape, k, False))
             continue
-        ends = sorted({0.0, 1.0, *(min(max(float(end), 0.0), 1.0) for part in parts for end in part)})
+        ends = sorted({0.0, 1.0, *(end for part in parts for end in part)})
         for low, high in pairwise(ends):
             hidden = any(part[0] <= (low + high) / 2 <= part[1] for part in parts)
             pieces.append((substring(shape, low, high, normalized=True), k, hidden))

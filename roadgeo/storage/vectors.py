@@ -23,7 +23,7 @@ from roadgeo.storage.fence import remedy
 from roadgeo.storage.gdal import CONSENT, NETWORK, OWN_SHIFT, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
-__all__ = ["VectorLayer", "describe_layer", "first_line", "list_layers", "read_layer", "require_file"]
+__all__ = ["VectorLayer", "beside", "describe_layer", "first_line", "list_layers", "read_layer", "require_file"]
 
 #: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
 _DRIVERS = {
@@ -144,17 +144,41 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
 
 @contextmanager
 def _aside(path: Path) -> Iterator[Path]:
-    """Yield a link to an XML file in a passing folder: GDAL writes down beside a GML file what it found in it."""
-    if not path.is_file() or _head(path)[:1] != b"<":
+    """Yield a link in a passing folder to a file beside which GDAL writes.
+
+    Beside an XML file it does what it found in it, beside a shapefile a new index where that is missing or damaged.
+    """
+    import pyogrio
+
+    is_shapefile = path.suffix.lower() == ".shp" and path.is_file() and not _has_index(path)
+    if not path.is_file() or not (is_shapefile or _head(path)[:1] == b"<"):
         yield path
         return
+    files = [file for file in beside(path) if file.suffix.lower() != ".shx"] if is_shapefile else [path]
     with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
         link = Path(folder) / path.name
         try:
-            link.symlink_to(path.absolute())
+            for file in files:
+                (Path(folder) / file.name).symlink_to(file.absolute())
         except OSError:  # no links here (Windows, without leave)
             link = path
-        yield link
+        pyogrio.set_gdal_config_options({"SHAPE_RESTORE_SHX": "YES" if link != path else None})
+        try:
+            yield link
+        finally:
+            pyogrio.set_gdal_config_options({"SHAPE_RESTORE_SHX": None})
+
+
+def beside(path: Path) -> list[Path]:
+    """Return the files of a folder that share a file's stem: its own parts."""
+    return [file for file in path.absolute().parent.iterdir() if file.stem == path.stem]
+
+
+def _has_index(path: Path) -> bool:
+    """Whether a shapefile has an index that is as long as it says."""
+    index = next((file for file in beside(path) if file.suffix in (".shx", ".SHX")), None)
+    stated = b"" if index is None else index.read_bytes()[24:28]
+    return index is not None and 0 < 2 * int.from_bytes(stated, "big") == index.stat().st_size
 
 
 def _head(path: Path) -> bytes:

@@ -1,3 +1,6 @@
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
@@ -328,6 +331,38 @@ def test_archives(tmp_path, name):
         for file in (tmp_path / "deep").iterdir():
             archive.write(file, f"a/b/{file.name}")
     assert len(read_lines(tmp_path / name).lines) == len(streets()[0])
+
+
+@pytest.mark.parametrize("container", ["shp", "zip"])
+@pytest.mark.parametrize("index", ["missing", "cut off", "empty"])
+def test_a_shapefile_whose_index_is_lost_is_read_and_nothing_is_written_beside_it(tmp_path, index, container):
+    file, lost = write_streets(tmp_path / "a.shp"), tmp_path / "a.shx"
+    lost.write_bytes(lost.read_bytes()[: 0 if index == "empty" else -40])
+    if index == "missing":
+        lost.unlink()
+    if container == "zip":
+        file = Path(shutil.make_archive(str(tmp_path.parent / f"{tmp_path.name}{index}"), "zip", tmp_path))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(read_lines(file).lines) == len(streets()[0])
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.7])
+@pytest.mark.parametrize("suffix", [".dbf", ".DBF"])
+def test_a_table_that_is_cut_off_is_no_shapefile_without_kinds(tmp_path, share, suffix):
+    file, table = write_streets(tmp_path / "a.shp"), tmp_path / "a.dbf"
+    table.write_bytes(table.read_bytes()[: int(share * table.stat().st_size)])
+    table.rename(table.with_suffix(suffix))
+    with pytest.raises(RoadSourceError, match=r"its .dbf is cut off"):
+        read_lines(file)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.geojson", "a.tsv"])
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be"])
+def test_text_of_two_bytes_a_letter_says_so(tmp_path, name, encoding):
+    (tmp_path / name).write_bytes(b"\xfe\xff" * (encoding != "utf-16") + "WKT,highway\n".encode(encoding))
+    with pytest.raises(RoadSourceError, match="text in UTF-16; save it in UTF-8"):
+        read_lines(tmp_path / name)
 
 
 def test_names_of_columns_that_are_not_in_the_encoding_that_a_file_names(tmp_path):

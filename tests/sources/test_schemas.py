@@ -251,6 +251,21 @@ def test_lines_that_are_taken_without_a_kind_are_told(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
+@pytest.mark.parametrize("between", [[None, 0.4], [0.4, 0.0], [-0.1, 0.4], [0.6, None], [0.6, 2.0]])
+def test_a_part_of_a_segment_may_lack_an_end(tmp_path, container, between):
+    line, rule = shapely.LineString([(0, 0), (0, 0.01)]), [{"values": ["is_tunnel"], "between": between}]
+    columns = {"class": ["secondary"], "subtype": ["road"], "road_flags": [rule]}
+    source = tmp_path / f"a.{container}"
+    if container in ("frame", "parquet"):
+        table = gpd.GeoDataFrame(columns, geometry=[line], crs=4326)
+        table.to_parquet(tmp_path / "a.parquet")
+        source = table if container == "frame" else source
+    else:
+        write_vector(source, [line], **columns | {"road_flags": [json.dumps(rule)]})
+    assert shapely.length(choose_roads(source).lines).sum() == pytest.approx(0.6 * 1105.7, rel=1e-2)
+
+
+@pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
 def test_a_part_of_a_segment_in_a_tunnel_is_cut_out(tmp_path, container):
     """Overture's `between`: shares of the length."""
     line = shapely.LineString([(0, 0), (0, 0.01)])
