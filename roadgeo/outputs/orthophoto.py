@@ -30,7 +30,7 @@ from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.options import ImageOptions
 from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import UPRIGHT, read_orientation
-from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
+from roadgeo.storage.rasters import open_raster, raster_size, read_palette, value_bands, writing_raster
 
 __all__ = [
     "COMPRESSION",
@@ -79,7 +79,7 @@ def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
     with open_raster(path) as picture:
         factor = min(1.0, side / max(picture.width, picture.height))
         width, height = (max(round(length * factor), 1) for length in (picture.width, picture.height))
-        bands, palette = _value_bands(picture), read_palette(picture)
+        bands, palette = value_bands(picture), read_palette(picture)
         bands = bands[:3] if len(bands) >= 3 else bands[:1]
         averaged = Resampling.average if palette is None else Resampling.nearest
         values = picture.read(bands, out_shape=(len(bands), height, width), resampling=averaged)
@@ -207,12 +207,6 @@ def _tile(path: str | os.PathLike[str], folder: Path) -> str | os.PathLike[str]:
         return copy
 
 
-def _value_bands(picture: Any) -> list[int]:
-    return [
-        band for band, color in zip(picture.indexes, picture.colorinterp, strict=True) if color != ColorInterp.alpha
-    ]
-
-
 @dataclass(frozen=True)
 class _Plan:
     """A picture and its placement on the output grid."""
@@ -232,7 +226,7 @@ class _Plan:
     @cached_property
     def bands(self) -> list[int]:
         """Bands that are read: all but alpha, which is drawn anew."""
-        return _value_bands(self.picture)
+        return value_bands(self.picture)
 
     @cached_property
     def palette(self) -> AnyArray | None:

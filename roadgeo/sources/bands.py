@@ -15,7 +15,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import are_labels, are_patches, are_roads
-from roadgeo.storage.rasters import open_raster, page_of, read_palette, sidecar_nodata
+from roadgeo.storage.rasters import open_raster, page_of, read_palette, sidecar_nodata, value_bands
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -139,12 +139,10 @@ def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
 
 def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Bands:
     """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
-    from rasterio.enums import ColorInterp, MaskFlags
+    from rasterio.enums import MaskFlags
     from rasterio.windows import Window
 
-    colour = [
-        i for i, meaning in zip(dataset.indexes, dataset.colorinterp, strict=True) if meaning != ColorInterp.alpha
-    ]
+    colour = value_bands(dataset)
     if not colour:
         raise MaskError(f"{name}: holds no band of values; give an image or GeoTIFF")
     meanings = [dataset.colorinterp[i - 1].name for i in colour]

@@ -50,6 +50,7 @@ __all__ = [
     "require_file",
     "require_there",
     "sidecar_nodata",
+    "value_bands",
     "writing_raster",
 ]
 
@@ -242,6 +243,11 @@ def read_palette(dataset: DatasetReader, band: int = 1, channels: int = 3) -> An
         return None
     colors = dataset.colormap(band)
     return np.array([colors.get(i, (0, 0, 0, 255))[:channels] for i in range(256)], np.uint8)
+
+
+def value_bands(dataset: DatasetReader) -> list[int]:
+    """Return the numbers of the bands, without that of transparency."""
+    return [i for i, color in zip(dataset.indexes, dataset.colorinterp, strict=True) if color.name != "alpha"]
 
 
 def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:

@@ -16,7 +16,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo._text import visible
 from roadgeo.errors import MaskError
-from roadgeo.storage.rasters import MAX_SIDE, open_raster, page_of, read_palette
+from roadgeo.storage.rasters import MAX_SIDE, open_raster, page_of, read_palette, value_bands
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -138,14 +138,12 @@ class _Box(NamedTuple):
 
 def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
     """Return the numbers of the red, green and blue band, or one of grey."""
-    from rasterio.enums import ColorInterp
-
     meaning = dict(zip(dataset.colorinterp, dataset.indexes, strict=True))
     named = {str(text).strip().lower(): i for text, i in zip(dataset.descriptions, dataset.indexes, strict=True)}
     for names in (named, {colour.name: i for colour, i in meaning.items()}):
         if {"red", "green", "blue"} <= names.keys():
             return [names["red"], names["green"], names["blue"]]
-    shown = [i for i, m in zip(dataset.indexes, dataset.colorinterp, strict=True) if m != ColorInterp.alpha]
+    shown = value_bands(dataset)
     if not shown:
         raise MaskError(f"{name}: holds no band of values; give a photograph")
     return shown[:3] if len(shown) >= 3 else shown[:1]

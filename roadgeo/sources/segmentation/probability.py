@@ -70,11 +70,11 @@ class ProbabilityMap:
         size, observed = shape[::-1], self.values != NODATA
         smaller = shape[0] < self.values.shape[0]
         way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-        values: AnyArray = cv2.resize(np.where(observed, self.values, 0).astype(np.uint8), size, interpolation=way)
+        known = np.where(observed, self.values, 0).astype(np.uint8)
+        values = np.minimum(cv2.resize(known, size, interpolation=way), PROBABILITY_SURE)
         if not observed.all():
             kept = cv2.resize(observed.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            values = np.where(kept > 0, np.minimum(values, PROBABILITY_SURE), NODATA).astype(np.uint8)
-        values = np.minimum(values, PROBABILITY_SURE) if observed.all() else values
+            values = np.where(kept > 0, values, NODATA).astype(np.uint8)
         return replace(self, values=values, pixel=self.pixel * self.values.shape[1] / shape[1])
 
     def write(self, path: str | os.PathLike[str]) -> None:
