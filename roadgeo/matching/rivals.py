@@ -148,13 +148,16 @@ class Rivals:
         return 2.0 * math.log10(larger(self.ledger.n_reference))
 
     def _by_picture(self, estimator: TripleEstimator) -> Place:
-        """Compare the place that the picture favours with its best rival."""
+        """Compare the place that the picture favours with its best rival.
+
+        A rival that leads by less than the score needed is not located either: it leads the place by no more.
+        """
         ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]
         gsd_m = ranked[0].gsd_m
         best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
         for _ in range(_MOST_TURNS):
             compared = self._compare_by_picture(estimator, estimator.refine_whole(best), ranked)
-            if not _is_beaten(compared):
+            if compared.rival is None or _lead(compared.rival, compared) < self.needed:
                 break
             best = self._take(estimator, compared.rival, ranked)
         return compared
@@ -258,6 +261,11 @@ class Rivals:
 def _is_beaten(place: Place) -> bool:
     """Return whether a place's rival explains more."""
     return place.rival is not None and place.rival.log10_likelihood > place.log10_likelihood
+
+
+def _lead(place: Place, other: Place) -> float:
+    """Return the log10 lead of a place over another by the picture."""
+    return Picture.lead(place.log10_likelihood, other.log10_likelihood)
 
 
 def _penalty(place: Place) -> float:

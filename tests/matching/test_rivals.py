@@ -14,7 +14,7 @@ from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.place import Place
+from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about
@@ -294,3 +294,21 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
     assert Rivals({item: estimator}, Ledger(), NEEDED).compare(item).score == pytest.approx(lead)
+
+
+@pytest.mark.parametrize(("by", "n_compared"), [(-1.0, 1), (1.0, 1), (4.0, 2)])
+def test_the_picture_takes_a_rival_that_leads_by_what_is_needed(plain, monkeypatch, by, n_compared):
+    truth, index, evidence = plain
+    soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
+    estimator = TripleEstimator(soft, index)
+    estimator.settle(Place(soft, index, truth))
+    compared: list[Place] = []
+
+    def compare(_, __, place, ___):
+        compared.append(place)
+        here, there = (place.but(by=Weight(likelihood, 250.0)) for likelihood in (5.0, 5.0 + by))
+        return here.but(rival=there if len(compared) == 1 else None)
+
+    monkeypatch.setattr(Rivals, "_compare_by_picture", compare)
+    Rivals({Search(estimator): estimator}, Ledger(), NEEDED)._by_picture(estimator)
+    assert len(compared) == n_compared
