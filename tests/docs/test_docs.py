@@ -85,8 +85,7 @@ def desk(shelf, tmp_path, monkeypatch):
     folder = tmp_path / "desk"
     shutil.copytree(shelf, folder)
     kernels = kernel_folder()
-    (tmp_path / "roadgeo_cache").mkdir()
-    (tmp_path / "roadgeo_cache" / kernels.name).symlink_to(kernels, target_is_directory=True)
+    shutil.copytree(kernels, tmp_path / "roadgeo_cache" / kernels.name)  # within the fence of what is started
     for name in ("HOME", "XDG_DATA_HOME", "ROADGEO_CACHE", "ROADGEO_LIBRARY"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
     (tmp_path / "home").mkdir()
