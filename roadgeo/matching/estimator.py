@@ -139,7 +139,7 @@ class TripleEstimator:
         self._n_rounds, self._n_by_roads, self._anchors = 0, 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
-        self.in_company = False  # whether it is searched with others first, by the first sweep, and then alone
+        self.in_company = False  # whether it is searched with others first, by triples, and then alone
 
     def leave_company(self) -> None:
         """Go on as if no other part were searched; the places that were verified stay known."""
@@ -156,22 +156,17 @@ class TripleEstimator:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do, too, where
-        units are searched alone: the sweeps were done on all of them together.
+        units are searched alone: triples were looked up on all of them together, and take half as long again.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
-        sweeps = [self.sweeps.rounds(self, source) for source in sources]
+        stages = [self.sweeps.rounds(self, source) for source in sources]
+        if by_roads and not self.in_company:
+            roads_first = self.sweeps.alone or self.index.coarseness > 1.0
+            stages.insert(0 if roads_first else len(stages), self._rounds_of_roads())
         if self.proposed is not None:
             yield iter([self.proposed])
-        if self.in_company:
-            yield from sweeps
-            return
-        if not by_roads:
-            yield from sweeps
-            return
-        roads = [self._rounds_of_roads()]
-        roads_first = self.sweeps.alone or self.index.coarseness > 1.0
-        yield from roads + sweeps if roads_first else sweeps + roads
+        yield from stages
 
     @property
     def work(self) -> float:
