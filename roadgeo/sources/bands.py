@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._text import listed
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import are_labels, are_patches, are_roads
 from roadgeo.storage.rasters import open_raster, page_of, read_palette, sidecar_nodata, value_bands
@@ -27,7 +28,6 @@ PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
 
 _MAX_CLASSES = 32  # whose colours a palette holds
 _MAX_BANDS = 3  # of a mask, unless one of them is chosen
-_MOST_LISTED = 8
 _MIDDLE_PIXELS = 1 << 22  # by which alpha is judged
 
 #: Words for roads in names of bands, and words for properties of roads, or for all else.
@@ -93,8 +93,7 @@ class Bands:
     @property
     def options(self) -> str:
         """How a band is chosen, for people."""
-        shown = ", ".join(self.all_bands[:_MOST_LISTED])
-        return f"--band {shown}" + (" ..." if len(self.all_bands) > _MOST_LISTED else "")
+        return f"--band {listed(self.all_bands)}"
 
 
 @contextmanager

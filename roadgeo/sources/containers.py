@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from roadgeo._arrays import AnyArray
+from roadgeo._text import listed
 from roadgeo.errors import NoRoadsError, RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through, objects
 from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_ways
@@ -208,7 +209,7 @@ def _choose_parts(path: Path, asked: Sequence[str], *, areas: bool) -> list[_Par
         drawn = [name for name, kind in layers if "Polygon" in kind]
     if not drawn:
         kinds = sorted({kind for _, kind in layers}) or ["nothing"]
-        raise NoRoadsError(f"{path}: holds {_listed(kinds)}, expected lines: the centre lines of roads")
+        raise NoRoadsError(f"{path}: holds {listed(kinds)}, expected lines: the centre lines of roads")
     if len(drawn) > 1:
         drawn = [name for name in drawn if _is_filled(path, name)] or drawn[:1]
     preferred = [name for name in _LAYERS if name in drawn]
@@ -219,10 +220,10 @@ def _choose_parts(path: Path, asked: Sequence[str], *, areas: bool) -> list[_Par
         return [_Part(chosen[0], column, tuple(asked))]
     if asked:
         wrong = next(name for name in asked if name not in {*names, *levels})
-        raise RoadSourceError(f"{path}: no layer {wrong!r}; it has {_listed(names + levels)}: choose with --layer")
+        raise RoadSourceError(f"{path}: no layer {wrong!r}; it has {listed(names + levels)}: choose with --layer")
     if not chosen or len(levels) > 1:
         raise RoadSourceError(
-            f"{path}: several layers hold lines, {_listed(levels or drawn)}: choose with --layer, which is repeatable"
+            f"{path}: several layers hold lines, {listed(levels or drawn)}: choose with --layer, which is repeatable"
         )
     return [_Part(name) for name in chosen]
 
@@ -266,14 +267,8 @@ def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
     head = read_layer(path, layer, fields, 0, _PEEK).columns
     column = next((name for name in fields if name.lower() in _LEVELS), "")
     levels = _names_of(head.get(column.lower(), np.empty(0, object)), path)
-    hint = f"{column}: {_listed(levels)}" if len(levels) > 1 else ""
+    hint = f"{column}: {listed(levels)}" if len(levels) > 1 else ""
     return total, chosen + [name for name in fields if name not in chosen and names_kinds(head[name.lower()])], hint
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Join names for a message, at most eight."""
-    shown = ", ".join(names[:8])
-    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
 
 
 def _what_is_wrong(path: Path) -> str:

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
-from roadgeo._text import visible
+from roadgeo._text import listed, visible
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.borders import find_border
@@ -42,7 +42,6 @@ _STRIP_PIXELS = 1 << 25  # rows are read and thresholded in strips of this size
 _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are interpreted
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _MAX_ROAD_SHARE = 0.35  # of a frame
-_MOST_LISTED = 8
 #: Drawings in two colours, smooth or as JPEG: share of the variance along one line of colours, of pixels beyond either
 #: end, how far from an end of 0 to 255 a colour counts as pure, and most mixed pixels for each of the rarer end.
 _ON_A_LINE, _END, _PURE, _MOST_MIXED = 0.97, 0.002, 38, 1.5
@@ -275,8 +274,8 @@ def _of_class(raster: Bands, number: int) -> Bands:
         raise MaskError(f"{raster.name}: has several bands; choose the one that holds the classes: {raster.options}")
     classes = np.unique(_sample(raster)[0])
     if number not in classes:
-        listed = ", ".join(f"{value:g}" for value in classes[:_MOST_LISTED])
-        raise MaskError(f"{raster.name}: holds no value {number}, but {listed}; give the one that is road with --class")
+        held = listed([f"{value:g}" for value in classes])
+        raise MaskError(f"{raster.name}: holds no value {number}, but {held}; give the one that is road with --class")
     return _changed(raster, lambda values, valid: ((values == number).view(np.uint8), _finite(values, valid)))
 
 

@@ -17,7 +17,7 @@ import pytest
 import rasterio
 import rasterio.control
 from support.loopback import counting_server
-from worlds.hostile import mrf
+from worlds.hostile import mrf, virtual
 from worlds.pngs import png
 from worlds.rasters import write_raster
 from worlds.turned import mark_turned, save_turned
@@ -53,13 +53,6 @@ def victim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def vrt(source: object) -> str:
-    return (
-        '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
-        f'<SourceFilename relativeToVRT="0">{source}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>'
-    )
-
-
 READERS: list[Callable[[Path], object]] = [read_mask, lambda path: read_preview(path, 200), read_focal_length]
 
 
@@ -81,7 +74,7 @@ class TestNothingIsWritten:
     def test_by_a_file_of_another_format(self, tmp_path, victim, read, name, content, message):
         inner, path = tmp_path / "inner.bin", tmp_path / name
         inner.write_text(mrf(tmp_path, victim).read_text())
-        path.write_text(content.format(mrf=inner.read_text(), vrt=vrt(inner)))
+        path.write_text(content.format(mrf=inner.read_text(), vrt=virtual(tmp_path, str(inner)).read_text()))
         with pytest.raises(MaskError, match=message):
             read(path)
         assert victim.read_text() == "safe"
@@ -131,7 +124,7 @@ def server() -> Iterator[tuple[str, list[str]]]:
 def test_nothing_is_fetched(tmp_path, server, victim, roads, read):
     address, asked = server
     texts = {
-        "vrt": vrt(f"/vsicurl/{address}/a.tif"),
+        "vrt": virtual(tmp_path, f"/vsicurl/{address}/a.tif").read_text(),
         "wms": f'<GDAL_WMS><Service name="TMS"><ServerUrl>{address}/${{z}}</ServerUrl></Service></GDAL_WMS>',
         "wcs": f"<WCS_GDAL><ServiceURL>{address}/?</ServiceURL><CoverageName>a</CoverageName></WCS_GDAL>",
         "wmts": f"<GDAL_WMTS><GetCapabilitiesUrl>{address}/?</GetCapabilitiesUrl></GDAL_WMTS>",
@@ -153,7 +146,7 @@ def test_nothing_is_fetched(tmp_path, server, victim, roads, read):
 
 def test_a_virtual_raster_is_read_by_consent(tmp_path, roads, monkeypatch):
     path = tmp_path / "mask.vrt"
-    text = vrt(write_raster(tmp_path / "part.tif", roads)).replace('="64"', f'="{SIZE}"')
+    text = virtual(tmp_path, str(write_raster(tmp_path / "part.tif", roads))).read_text().replace('="64"', f'="{SIZE}"')
     path.write_text(text)
     with pytest.raises(MaskError, match=f"{CONSENT}=VRT"):
         read_mask(path)
