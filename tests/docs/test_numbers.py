@@ -6,7 +6,7 @@ import numpy as np
 from support.documents import ROOT, said, value
 
 from roadgeo.evaluation.noise import NOISE_MODELS
-from roadgeo.evaluation.scoring import share
+from roadgeo.evaluation.scoring import RADIUS_M, share
 from roadgeo.flights import tracker
 from roadgeo.geometry import pose, projection
 from roadgeo.geometry.camera import CameraOptions
@@ -203,7 +203,7 @@ FROM_CODE = [
     ("docs/scale.md", r"more than (\d+) megapixels", vectorization._MAX_WORKING_PIXELS / 1e6),
     ("docs/scale.md", r"keeps up to ([\d.]+) GB of road rasters", road_search._MOST_BYTES / 1e9),
     ("docs/scale.md", r"at most 2\^(\d+) intersections \(([\d.]+) million\)", (24, round(MAX_ANCHORS / 1e6, 1))),
-    ("SECURITY.md", r"among (\w+) formats; NumPy", len(rasters._DRIVERS) - 1),
+    ("SECURITY.md", r"among (\w+) formats; NumPy", len({name for _, name in rasters._DRIVERS} - {"NumPy", "VRT"})),
     ("SECURITY.md", r"GDAL has (\d+) drivers", len(vectors._DRIVERS)),
     (
         "SECURITY.md",
@@ -223,6 +223,7 @@ FROM_CODE = [
     ),
     ("SECURITY.md", r"one after another, (half) a second apart", guard._GUESS_S),
     ("docs/how-well.md", r"\| ([\d.]+) to 5 \|", NEEDED),
+    ("docs/how-well.md", r"middle lies within (\d+) m, or", RADIUS_M),
     ("docs/paper.md", r"are fitted at (\d+) to (\d+) m", (TANGENT.skip_length, TANGENT.tangent_length)),
     ("docs/paper.md", r"([\d.]+) to ([\d.]+) road widths in a mask", (scene._SKIP, scene._TANGENT)),
     ("docs/paper.md", r"a line with the weight ([\d.]+):", intersections._STIFFNESS),

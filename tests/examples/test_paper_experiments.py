@@ -61,21 +61,22 @@ def test_the_experiments_form_the_tuples_of_the_product(porto, tmp_path, monkeyp
 
 
 def test_the_tables_are_made_of_all_tiles(town, data_dir, tmp_path):
-    """One tile of each kind."""
+    """One tile of each kind; Figures 9 and 10 show the photograph, which `pair` locates."""
     dataset = tmp_path / "dataset"
-    for name in ("tiles.csv", "segmentation/tiles.csv"):
+    for name, tile in (("tiles.csv", ""), ("segmentation/tiles.csv", "24928900")):
         (dataset / name).parent.mkdir(parents=True, exist_ok=True)
-        head, first, *_ = (data_dir / "massachusetts" / name).read_text().splitlines()
-        (dataset / name).write_text(f"{head}\n{first}\n")
+        head, *rows = (data_dir / "massachusetts" / name).read_text().splitlines()
+        (dataset / name).write_text(f"{head}\n{next(row for row in rows if tile in row)}\n")
     for name in ("masks", "segmentation/images", "roads_from_labels.parquet"):
         (dataset / name).symlink_to(data_dir / "massachusetts" / name)
-    more = ("--work-limit", 0.2, "--perspectives", 1, "--only", "tables")
+    more = ("--work-limit", 1, "--perspectives", 1, "--only", "tables")
     done = run(town, "--dataset", dataset, "-o", tmp_path, *more)
     assert done.returncode == 0, done.stderr
     assert {(row["method"], row["of"]) for row in json.loads((tmp_path / "table3.json").read_text())["rows"]} == {
         (method, of) for method in ("paper", "pair", "auto") for of in ("labels", "photographs")
     }
     assert "## Table 3" in (tmp_path / "tables.md").read_text()
+    assert all((tmp_path / f"figure{number}.png").is_file() for number in (9, 10))
 
 
 def test_what_is_missing_is_said_first(tmp_path):
