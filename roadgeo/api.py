@@ -290,7 +290,10 @@ def _with_hints(options: LocateOptions, given: Mapping[str, Any], image: Any) ->
 
         if not isinstance(image, str | os.PathLike):
             raise ValueError('"exif" is for files; give the value, or leave it out')
-        hints.update(read_stated(asked, os.fspath(image)))
+        try:
+            hints.update(read_stated(asked, os.fspath(image)))
+        except MaskError as error:
+            raise MaskError(as_keywords(str(error))) from error
     return apply_hints(options, hints)
 
 
@@ -342,7 +345,7 @@ def verify(
 
 @_hinted(FlightHints)
 def track(
-    frames: Any,
+    frames: Files,
     reference: References = (),
     *,
     motion: str | os.PathLike[str] | None = None,

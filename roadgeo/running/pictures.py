@@ -84,12 +84,21 @@ def read_picture(picture: Any) -> str | AnyArray:
         return _read_dataset(picture)
     if hasattr(picture, "getbands"):  # PIL
         return _read_pil(picture)
+    if hasattr(picture, "data_vars"):
+        raise MaskError(f"an xarray Dataset; give one of its variables: {', '.join(map(str, picture.data_vars))}")
     if hasattr(picture, "dims") and hasattr(picture, "values"):  # xarray
         return _read_xarray(picture)
+    if not (isinstance(picture, list | tuple) or hasattr(picture, "__array__")):
+        raise MaskError(
+            f"{type(picture).__name__} is no picture; expected a path, an array, or a picture of PIL, xarray, rasterio"
+        )
     array = np.ma.asanyarray(picture)
     if array.ndim not in (2, 3):
         raise MaskError(f"an array of shape {array.shape}; expected (rows, columns), with bands first or last")
-    return _bands_last(array)
+    array = _bands_last(array)
+    # Of four bands of which the last is full, as matplotlib and OpenCV read pictures, that one is alpha.
+    full = 1.0 if array.dtype.kind == "f" else np.iinfo(array.dtype).max if array.dtype.kind in "iu" else None
+    return array[..., :3] if array.ndim == 3 and array.shape[2] == 4 and (array[..., 3] == full).all() else array
 
 
 def pixels_of(picture: Any) -> dict[str, Any]:
@@ -110,6 +119,13 @@ def pixels_of(picture: Any) -> dict[str, Any]:
     labels = picture.coords[rest[0]].values if len(rest) == 1 and rest[0] in picture.coords else ()
     labels = named if isinstance(named := picture.attrs.get("long_name"), tuple | list) else labels
     labelled: dict[str, Any] = {"names": tuple(label for label in labels if isinstance(label, str))}
+    stated = getattr(picture.coords.get("spatial_ref"), "attrs", {})
+    crs, numbers = str(stated.get("crs_wkt") or ""), [float(one) for one in str(stated.get("GeoTransform", "")).split()]
+    if crs and len(numbers) == 6 and rows is not None and columns is not None:  # rioxarray's, of turned pictures, too
+        place = np.array([[*numbers[1:3], numbers[0]], [*numbers[4:6], numbers[3]], [0.0, 0.0, 1.0]])
+        size = picture.sizes[columns], picture.sizes[rows]
+        aspect, is_mirrored = Georeference(place, crs_name(crs), size, "geotransform").pixel_shape()
+        return {**labelled, "aspect": aspect, "mirror": is_mirrored}
     if rows is None or columns is None or not {rows, columns} <= set(picture.coords):
         return labelled
     x, y = (np.asarray(picture.coords[name].values, float) for name in (columns, rows))
@@ -117,7 +133,6 @@ def pixels_of(picture: Any) -> dict[str, Any]:
         return labelled
     wide, high = (x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)
     place = np.array([[wide, 0.0, x[0] - wide / 2], [0.0, high, y[0] - high / 2], [0.0, 0.0, 1.0]])
-    crs = str(getattr(picture.coords.get("spatial_ref"), "attrs", {}).get("crs_wkt") or "")
     named_crs = crs_name(crs) if crs else "EPSG:4326" if str(columns).lower() in _DEGREES else None
     aspect, is_mirrored = stretch_of(wide, high), wide * high > 0.0 and (y[0], high) not in ((0.0, 1.0), (0.5, 1.0))
     if named_crs is not None:

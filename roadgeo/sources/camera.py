@@ -132,12 +132,14 @@ class _View:
         if math.isnan(self.tilt_deg):
             return 0.0, _UNKNOWN_TILT_DEG
         if self.tilt_deg > _MOST_TILT_DEG:
-            raise MaskError(f"{self.path}: its camera looked at the horizon, as it states: leave out {hint}=exif")
+            raise MaskError(f"{self.path}: its camera looked at the horizon, as it states: leave out --{hint}")
         return max(self.tilt_deg - _TILT_OFF_DEG, 0.0), self.tilt_deg + _TILT_OFF_DEG
 
     def _stated(self, value: float, what: str, hint: str) -> float:
         if math.isnan(value):
-            raise MaskError(f"{self.path}: EXIF and XMP state no {what} of its camera: give {hint} as a value, or none")
+            raise MaskError(
+                f"{self.path}: EXIF and XMP state no {what} of its camera: give --{hint} as a value, or none"
+            )
         return value
 
 

@@ -1,4 +1,4 @@
-"""The georeference of a raster: a geotransform, control points, or a world file beside it."""
+"""The georeference of a raster: a geotransform, control points, or a world file or `.aux.xml` beside it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
 from roadgeo.sources.exif import read_position
 from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
-from roadgeo.storage.rasters import open_raster
+from roadgeo.storage.rasters import open_raster, read_sidecar
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -32,7 +32,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     Parameters
     ----------
     crs : str, optional
-        CRS of a world file, as pyproj takes it; it replaces the raster's own and a `.prj` beside it.
+        CRS of a world file, as pyproj takes it; it replaces the raster's own and that of files beside it.
 
     Raises
     ------
@@ -45,10 +45,10 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
         size = (raster.width, raster.height)
         own = _crs_of(raster) if crs is None else name_crs(crs)
         stated = _of_raster(raster)
-    source, matrix = stated or ("world file", _of_world_file(Path(path)))
+    source, matrix = stated or _of_files_beside(Path(path))
     if matrix is None:
         return None
-    if stated is None:  # a world file speaks of pixels as they are stored
+    if stated is None:  # files beside it speak of pixels as they are stored
         matrix = matrix @ stored_from_upright(read_orientation(path), size)
     own = own or _crs_beside(Path(path))
     if own is None:
@@ -85,10 +85,11 @@ def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:
 
 
 def _stated(path: str | os.PathLike[str]) -> Georeference | None:
-    """Return a raster's own georeference, where it has one."""
+    """Return a raster's own georeference, or one of files beside it, where it has one."""
     try:
         with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-            return read_georeference(path) if file.read(8).startswith(_HOLD_A_PLACE) else None
+            may_hold = file.read(8).startswith(_HOLD_A_PLACE) or _of_files_beside(Path(path))[1] is not None
+        return read_georeference(path) if may_hold else None
     except (MaskError, CrsError, OSError, ValueError):
         return None
 
@@ -100,7 +101,7 @@ def _crs_of(raster: DatasetReader) -> str | None:
 
 
 def _crs_beside(path: Path) -> str | None:
-    """Read the CRS in the `.prj` beside a picture."""
+    """Read the CRS in the `.prj` beside a picture, or in its `.aux.xml`."""
     for suffix in (".prj", ".PRJ"):
         beside = path.with_suffix(suffix)
         if beside.is_file():
@@ -108,7 +109,8 @@ def _crs_beside(path: Path) -> str | None:
                 return name_crs(beside.read_text("utf-8", "replace").strip())
             except CrsError as error:
                 raise CrsError(f"{beside}: {error}") from error
-    return None
+    stated = read_sidecar(path, "SRS")
+    return name_crs(stated) if stated else None
 
 
 def _of_raster(raster: DatasetReader) -> tuple[str, FloatArray] | None:
@@ -119,6 +121,18 @@ def _of_raster(raster: DatasetReader) -> tuple[str, FloatArray] | None:
         return None
     pixels = np.array([[point.col, point.row] for point in points], float)
     return "control points", fit_place(pixels, np.array([[p.x, p.y] for p in points], float), len(points) >= 5)
+
+
+def _of_files_beside(path: Path) -> tuple[str, FloatArray | None]:
+    """Read what a world file says, or a picture's `.aux.xml`."""
+    placed, stated = _of_world_file(path), read_sidecar(path, "GeoTransform")
+    if placed is not None or not stated:
+        return "world file", placed
+    try:
+        x, a, b, y, d, e = (float(word) for word in stated.split(","))
+    except ValueError as error:
+        raise MaskError(f"{path}.aux.xml: no geotransform; expected six numbers") from error
+    return "geotransform", np.array([[a, b, x], [d, e, y], [0.0, 0.0, 1.0]])
 
 
 def _of_world_file(path: Path) -> FloatArray | None:

@@ -9,6 +9,7 @@ here (`storage.orientation`). Rasterio is imported only here and late: it takes 
 from __future__ import annotations
 
 import contextlib
+import html
 import os
 import re
 import shutil
@@ -47,6 +48,7 @@ __all__ = [
     "page_of",
     "raster_size",
     "read_palette",
+    "read_sidecar",
     "require_file",
     "require_there",
     "sidecar_nodata",
@@ -251,15 +253,19 @@ def value_bands(dataset: DatasetReader) -> list[int]:
 
 
 def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
-    """Return the nodata value in the `.aux.xml` beside a raster: all that is taken from such a file."""
-    beside = Path(os.fspath(path) + ".aux.xml")
-    if not beside.is_file():
-        return None
-    match = re.search(rb"<NoDataValue[^<>]*+>\s*+([-+.0-9eEnaif]{1,32})\s*+</", beside.read_bytes())
+    """Return the nodata value in the `.aux.xml` beside a raster."""
     try:
-        return float(match[1]) if match else None
+        return float(read_sidecar(path, "NoDataValue"))
     except ValueError:
         return None
+
+
+def read_sidecar(path: str | os.PathLike[str], name: str) -> str:
+    """Return the text of an element in the `.aux.xml` beside a raster; "" without one. No more is taken of it."""
+    beside = Path(os.fspath(path) + ".aux.xml")
+    text = beside.read_text("utf-8", "replace") if beside.is_file() else ""
+    match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", text)
+    return html.unescape(match[1]).strip() if match else ""
 
 
 #: Suffixes of images, which no text has.

@@ -163,3 +163,39 @@ def test_names_of_bands() -> None:
     of_rioxarray = bands.assign_coords(band=[1, 2]).assign_attrs(long_name=("background", "road"))
     assert pixels_of(of_rioxarray)["names"] == ("background", "road")
     assert pixels_of(np.zeros((3, 4))) == {}
+
+
+@pytest.mark.parametrize("picture", [3.14, None, 5, {}, object(), b"abc"])
+def test_what_is_no_picture_is_named(picture):
+    with pytest.raises(MaskError, match=rf"^{type(picture).__name__} is no picture; expected a path, an array"):
+        read_picture(picture)
+
+
+def test_a_dataset_of_xarray_names_its_variables():
+    data = xarray.Dataset({"road": (("y", "x"), np.zeros((40, 50))), "width": (("y", "x"), np.zeros((40, 50)))})
+    with pytest.raises(MaskError, match="give one of its variables: road, width"):
+        read_picture(data)
+
+
+@pytest.mark.parametrize(("kind", "full"), [(np.uint8, 255), (np.uint16, 65535), (np.float32, 1.0)])
+@pytest.mark.parametrize("first", [False, True])
+def test_a_full_fourth_band_is_alpha(kind, full, first):
+    bands = np.random.default_rng(0).integers(0, 2, (40, 50, 4)).astype(kind)
+    assert read_picture(np.moveaxis(bands, 2, 0) if first else bands).shape == (40, 50, 4)
+    bands[..., 3] = full
+    assert read_picture(np.moveaxis(bands, 2, 0) if first else bands).shape == (40, 50, 3)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32629", "EPSG:3857", "+proj=utm +zone=29 +ellps=intl +towgs84=-87,-98,-121"])
+@pytest.mark.parametrize("turned", [0.0, 30.0])
+@pytest.mark.parametrize(("wide", "high"), [(1.0, -1.0), (1.0, 1.0), (2.0, -1.0)])
+def test_the_geotransform_of_rioxarray_states_the_shape_of_pixels(crs, turned, wide, high):
+    """It gives no coordinates to the axes of a turned picture."""
+    place = rasterio.Affine.translation(-957_000, 5_000_000) if crs == "EPSG:3857" else None
+    place = place or rasterio.Affine.translation(530_000, 4_557_000)
+    place = place @ rasterio.Affine.rotation(turned) @ rasterio.Affine.scale(wide, high)
+    stated = {"crs_wkt": pyproj.CRS(crs).to_wkt(), "GeoTransform": " ".join(map(str, place.to_gdal()))}
+    data = xarray.DataArray(np.zeros((40, 50)), dims=("y", "x")).assign_coords(spatial_ref=0)
+    data.spatial_ref.attrs.update(stated)
+    assert pixels_of(data)["mirror"] == (high > 0)
+    assert (pixels_of(data)["aspect"] or 1.0) == pytest.approx(wide / abs(high), rel=1e-2)

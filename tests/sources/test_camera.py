@@ -76,10 +76,10 @@ def test_any_file_may_state_it(tmp_path: Path, suffix: str) -> None:
     ("name", "missing", "message"),
     [
         ("near", {"xmp": MAKERS["DJI"], "position": False}, "state no position"),
-        ("near", {}, "state no height"),
+        ("near", {}, "state no height of its camera: give --near as a value, or none"),
         ("gsd_m", {"altitude": 300.0}, "state no height above the ground"),
         ("gsd_m", {"xmp": MAKERS["DJI"], "focal": False}, "no focal length"),
-        ("heading_deg", {}, "state no direction"),
+        ("heading_deg", {}, "state no direction of its camera: give --heading as a value, or none"),
         ("near", {"xmp": MAKERS["DJI"].replace("-60", "-05")}, "looked at the horizon"),
     ],
 )

@@ -1,5 +1,6 @@
 """Georeferences of rasters: read from every place where they may stand, and moved."""
 
+import html
 import warnings
 from pathlib import Path
 
@@ -137,7 +138,9 @@ SHIFTED = {
 }
 
 
-@pytest.mark.parametrize("where", ["geotransform", "control points", "turned", "jp2", "img", "prj"])
+@pytest.mark.parametrize(
+    "where", ["geotransform", "control points", "turned", "jp2", "img", "prj", "aux.xml", "aux.xml and world file"]
+)
 @pytest.mark.parametrize("name", SHIFTED)
 def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: str) -> None:
     if (name, where) == ("of no name", "img"):
@@ -162,8 +165,16 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
     else:
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), BLACK)
-        path.with_suffix(".wld").write_text(f"{step}\n0\n0\n{-step}\n{west + step / 2}\n{north - step / 2}\n")
-        path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
+        if where != "aux.xml":
+            path.with_suffix(".wld").write_text(f"{step}\n0\n0\n{-step}\n{west + step / 2}\n{north - step / 2}\n")
+        if where == "prj":
+            path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
+        else:
+            numbers = ", ".join(map(str, place.to_gdal())) if where == "aux.xml" else ""
+            Path(f"{path}.aux.xml").write_text(
+                f'<PAMDataset><SRS dataAxisToSRSAxisMapping="1,2">{html.escape(crs.to_wkt("WKT1_GDAL"))}</SRS>'
+                f"<GeoTransform> {numbers}</GeoTransform></PAMDataset>"
+            )
     found = read_georeference(path)
     assert found is not None
     middle = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform(*at(place, 40, 30))
@@ -214,6 +225,22 @@ def test_the_shape_of_pixels_is_as_the_file_states_it(tmp_path, crs, steps, shap
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("where", ["world file", "aux.xml"])
+def test_files_beside_a_picture_state_the_shape_of_its_pixels(tmp_path: Path, where: str) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), BLACK)
+    if where == "world file":
+        (tmp_path / "a.pgw").write_text("2\n0\n0\n1\n530000\n4557000\n")
+        (tmp_path / "a.prj").write_text(pyproj.CRS(32629).to_wkt("WKT1_ESRI"))
+    else:
+        stated = (
+            f"<SRS>{pyproj.CRS(32629).to_wkt('WKT1_GDAL')}</SRS><GeoTransform>530000,2,0,4557000,0,1</GeoTransform>"
+        )
+        (tmp_path / "a.png.aux.xml").write_text(f"<PAMDataset>{stated}</PAMDataset>")
+    aspect, is_mirrored = read_pixel_shape(tmp_path / "a.png")
+    assert aspect == pytest.approx(2.0, rel=1e-3)
+    assert is_mirrored
+
+
 def test_files_that_state_no_shape_have_square_pixels(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
     assert read_pixel_shape(tmp_path / "a.png") == (None, False)
