@@ -80,7 +80,7 @@ def locate_passes(
     options: LocateOptions,
     how: Locate,
 ) -> Sighting:
-    """Take one pass after another until a mask is located, within the limits of one search.
+    """Take one pass after another until a mask is located or the map is empty there, within the limits of one search.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def locate_passes(
         time_left -= seconds.vectorize + seconds.match + seconds.refine
         location = _discount(location, roads.what, tried, options)
         sightings.append(Sighting(location, roads.mask, explanation, roads.probability))
-        if sightings[-1].location.located:
+        if sightings[-1].location.located or location.reason_code is Reason.FEW_NEAR:  # which others find, too
             break
     if not sightings:
         raise failure or MaskError("nothing to look at; give a mask or a photograph")

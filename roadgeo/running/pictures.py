@@ -119,12 +119,13 @@ def pixels_of(picture: Any) -> dict[str, Any]:
     labels = picture.coords[rest[0]].values if len(rest) == 1 and rest[0] in picture.coords else ()
     labels = named if isinstance(named := picture.attrs.get("long_name"), tuple | list) else labels
     labelled: dict[str, Any] = {"names": tuple(label for label in labels if isinstance(label, str))}
-    stated = getattr(picture.coords.get("spatial_ref"), "attrs", {})
-    crs, numbers = str(stated.get("crs_wkt") or ""), [float(one) for one in str(stated.get("GeoTransform", "")).split()]
+    noted: dict[str, Any] = getattr(picture.coords.get("spatial_ref"), "attrs", {})
+    crs = crs_name(str(noted["crs_wkt"])) if noted.get("crs_wkt") else None
+    numbers = [float(one) for one in str(noted.get("GeoTransform", "")).split()]
     if crs and len(numbers) == 6 and rows is not None and columns is not None:  # rioxarray's, of turned pictures, too
         place = np.array([[*numbers[1:3], numbers[0]], [*numbers[4:6], numbers[3]], [0.0, 0.0, 1.0]])
         size = picture.sizes[columns], picture.sizes[rows]
-        aspect, is_mirrored = Georeference(place, crs_name(crs), size, "geotransform").pixel_shape()
+        aspect, is_mirrored = Georeference(place, crs, size, "geotransform").pixel_shape()
         return {**labelled, "aspect": aspect, "mirror": is_mirrored}
     if rows is None or columns is None or not {rows, columns} <= set(picture.coords):
         return labelled
@@ -133,7 +134,7 @@ def pixels_of(picture: Any) -> dict[str, Any]:
         return labelled
     wide, high = (x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)
     place = np.array([[wide, 0.0, x[0] - wide / 2], [0.0, high, y[0] - high / 2], [0.0, 0.0, 1.0]])
-    named_crs = crs_name(crs) if crs else "EPSG:4326" if str(columns).lower() in _DEGREES else None
+    named_crs = crs or ("EPSG:4326" if str(columns).lower() in _DEGREES else None)
     aspect, is_mirrored = stretch_of(wide, high), wide * high > 0.0 and (y[0], high) not in ((0.0, 1.0), (0.5, 1.0))
     if named_crs is not None:
         aspect, is_mirrored = Georeference(place, named_crs, (len(x), len(y)), "geotransform").pixel_shape()

@@ -1,10 +1,12 @@
 """Several passes share the limits of one search, and each costs its part of the odds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds.answers import moved, placed
 
-from roadgeo.errors import MaskError
+from roadgeo.errors import MaskError, Reason
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Spent, Stats
 from roadgeo.matching.options import LocateOptions
@@ -53,6 +55,13 @@ def test_each_pass_costs_its_part_of_the_odds_and_of_the_time():
     assert location.places[0].score == location.log10_odds
     assert "its roads were traced in 3 ways, here at pass 2" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
+
+
+def test_a_place_where_the_map_has_nothing_is_no_place_for_other_passes():
+    nothing = replace(found("not_located"), reason="0 intersections", reason_code=Reason.FEW_NEAR)
+    location, limits = take(nothing, found(odds=30.0))
+    assert location.reason == "0 intersections"
+    assert limits == [6.0]
 
 
 def test_what_is_too_unlikely_for_a_second_pass_is_refused():
