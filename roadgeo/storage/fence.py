@@ -53,47 +53,22 @@ _RESULTS = _LIST | _MAKE | _REMOVE | _REMOVE_FOLDER | _REFER
 _OWN = _RESULTS | _USE | _TRUNCATE
 
 #: The system's own. From /etc and /proc, only files that libraries need: the rest describes users and their programs.
-_SYSTEM: tuple[str, ...] = (
-    "/usr",
-    "/lib",
-    "/lib32",
-    "/lib64",
-    "/bin",
-    "/sbin",
-    "/opt",
-    "/nix/store",
-    "/gnu/store",
-    "/sys",
+_SYSTEM = (
+    *("/usr", "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/opt", "/nix/store", "/gnu/store", "/sys"),
+    *("/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/version", "/proc/filesystems", "/proc/sys"),
+    *(f"/proc/self/{name}" for name in ("cgroup", "maps", "mountinfo", "mounts", "stat", "statm", "status")),
 )
-_SYSTEM += ("/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/version", "/proc/filesystems", "/proc/sys")
-_SYSTEM += tuple(f"/proc/self/{name}" for name in ("cgroup", "maps", "mountinfo", "mounts", "stat", "statm", "status"))
 _ETC = (
     *("alternatives", "ca-certificates", "fonts", "gai.conf", "host.conf", "hosts", "ld.so.cache", "ld.so.conf"),
-    *(
-        "ld.so.conf.d",
-        "ld.so.preload",
-        "locale.alias",
-        "localtime",
-        "mime.types",
-        "nsswitch.conf",
-        "os-release",
-        "pki",
-        "protocols",
-    ),
-    *("resolv.conf", "services", "ssl", "timezone"),
+    *("ld.so.conf.d", "ld.so.preload", "locale.alias", "localtime", "mime.types", "nsswitch.conf", "os-release", "pki"),
+    *("protocols", "resolv.conf", "services", "ssl", "timezone"),
 )
 _DEVICES = ("null", "zero", "full", "random", "urandom", "tty", "pts")
 #: Variables that name data of libraries.
-_DATA: tuple[str, ...] = (
-    "PROJ_DATA",
-    "PROJ_LIB",
-    "GDAL_DATA",
-    "GDAL_DRIVER_PATH",
-    "LD_LIBRARY_PATH",
-    "SSL_CERT_FILE",
-    "SSL_CERT_DIR",
+_DATA = (
+    *("PROJ_DATA", "PROJ_LIB", "GDAL_DATA", "GDAL_DRIVER_PATH", "LD_LIBRARY_PATH"),
+    *("SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"),
 )
-_DATA += ("REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
 
 #: How systems word that they did not open a file.
 _REFUSED = re.compile(r"Permission denied|Operation not permitted")

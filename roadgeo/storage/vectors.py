@@ -211,12 +211,8 @@ def _offline() -> Iterator[None]:
     """Let no request of pyogrio's GDAL reach anything; a file's own datum shift stays."""
     import pyogrio
 
-    options = {
-        **NETWORK,
-        **OWN_SHIFT,
-        "GML_DOWNLOAD_SCHEMA": "NO",
-        "DXF_INLINE_BLOCKS": "NO",
-    }  # blocks within blocks have no end
+    # Blocks of a drawing within blocks have no end.
+    options = {**NETWORK, **OWN_SHIFT, "GML_DOWNLOAD_SCHEMA": "NO", "DXF_INLINE_BLOCKS": "NO"}
     before = {name: pyogrio.get_gdal_config_option(name) for name in options}
     exempt = {name: os.environ.pop(name) for name in ("no_proxy", "NO_PROXY") if name in os.environ}
     pyogrio.set_gdal_config_options(options)
