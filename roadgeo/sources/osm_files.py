@@ -81,7 +81,7 @@ def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder:
                 yield _table(ways, n_read, n_lost, meta)
                 ways, n_read, n_lost = [], 0, 0
         yield _table(ways, n_read, n_lost, meta)
-    except (RuntimeError, OSError, ValueError, MemoryError, osmium.InvalidLocationError) as error:
+    except (RuntimeError, OSError, ValueError, osmium.InvalidLocationError) as error:
         raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
 
 

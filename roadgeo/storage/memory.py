@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import RoadSourceError
+from roadgeo.errors import RoadSourceError, is_of_memory
 from roadgeo.storage.fence import is_inside
 
 __all__ = ["MEMORY", "bounded", "each_bounded", "give_back_memory", "let_pages_go"]
@@ -55,7 +55,9 @@ def bounded(path: str | os.PathLike[str], before: int | None = None) -> Iterator
     resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
     try:
         yield
-    except MemoryError as error:
+    except Exception as error:
+        if not is_of_memory(error):
+            raise
         raise RoadSourceError(
             f"{os.fspath(path)}: takes more than {most / 1e9:.1f} GB of memory to read; if you trust it, --memory GB"
         ) from error

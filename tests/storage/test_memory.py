@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import shapely
 
+from roadgeo.errors import RoadSourceError
 from roadgeo.storage.fence import abi_version
-from roadgeo.storage.memory import _allowance, let_pages_go
+from roadgeo.storage.memory import _allowance, bounded, let_pages_go
 
 CODE = """
 import numpy, shapely
@@ -143,3 +144,19 @@ def test_the_bound_goes_with_the_file_and_is_the_users(monkeypatch: pytest.Monke
     assert _allowance(tmp_path / "small") == 1 << 29
     monkeypatch.setenv("ROADGEO_MEMORY", "2.5")
     assert _allowance(tmp_path / "small") == 2_500_000_000
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("std::bad_alloc"), RoadSourceError("a.osm: Out of memory")]
+)
+def test_whoever_reads_may_say_in_its_own_words_that_memory_is_short(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setenv("ROADGEO_MEMORY", "8")
+    with (
+        pytest.raises(RoadSourceError, match=r"a\.osm: takes more than 8\.0 GB of memory to read; .*--memory"),
+        bounded("a.osm"),
+    ):
+        raise error
+    with pytest.raises(RoadSourceError, match="damaged"), bounded("a.osm"):
+        raise RoadSourceError("a.osm: damaged")
