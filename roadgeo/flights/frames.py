@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,6 +47,13 @@ _LOG = logging.getLogger(__name__)
 _USUAL_RATE = 25.0
 _LONG_S = 3600.0  # no flight is filmed with a gap of this length: another clock begins
 _HEAD_BYTES = 4096
+#: Times in names: a date; seconds since 1970, with digits of a fraction, or milli-, micro- or nanoseconds; seconds with
+#: a fraction behind a point.
+_TIMES = (
+    re.compile(r"(?<!\d)((?:19|20)\d\d-?\d\d-?\d\d[-_T ]?\d\d[-:]?\d\d[-:]?\d\d)(?:\.(\d{1,9}))?(?!\d)"),
+    re.compile(r"(?<![\d.])(1\d{9})\.?(\d{3}|\d{6}|\d{9})?$"),
+    re.compile(r"^(?:.*[^\d.-])?(-?\d{1,10})\.(\d{1,9})(?:s|sec|seconds)?$"),
+)
 _WHOLE_SHARE = 0.95  # of the frames that a container states: some only estimate their number
 
 
@@ -65,7 +74,7 @@ class FrameOptions:
     every_s : float
         Time between the frames taken of a video; 0: all.
     interval_s : float or None
-        Time between images. None: as EXIF states it, where all of them have times, else a second.
+        Time between images. None: as EXIF or names state it, where all of them have times, else a second.
     aspect : float or None
         How many times a pixel is as wide as high. None: as each file states it, else square.
     recursive : bool
@@ -201,23 +210,48 @@ def _is_video(path: str) -> bool:
 
 
 def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[float]]:
-    """Return images in the order of their times, and their times; none where EXIF does not have all of them.
+    """Return images in the order of their times, and their times; none where neither EXIF nor names have all of them.
 
-    Frames of one second are spread over it, where EXIF has whole ones.
+    Frames of one second are spread over it, where whole ones are given.
     """
     if options.interval_s is not None or len(paths) < 2:
         return paths, []
-    taken = [read_time(path) for path in paths]
-    times = [time for time in taken if time is not None]
+    times = [time for time in map(read_time, paths) if time is not None]
     if len(times) < len(paths) or len({*times}) == 1:
-        _LOG.warning("images are taken to be 1 s apart: not all of them have times of EXIF; --interval says otherwise")
-        return paths, []
+        times = _named_times(paths)
+        if not times:
+            _LOG.warning(
+                "images are taken to be 1 s apart: not all of them have times of EXIF; --interval says otherwise"
+            )
+            return paths, []
+        _LOG.warning("frames have the times that stand in their names; --interval says otherwise")
     order = sorted(range(len(paths)), key=times.__getitem__)
     if order != [*range(len(paths))]:
-        _LOG.warning("frames come in the order of their times, by EXIF, not of their names")
+        _LOG.warning("frames come in the order of their times, not of their names")
     of_one = Counter(times)
     seconds = [times[k] + times[:k].count(times[k]) / of_one[times[k]] for k in order]
     return [paths[k] for k in order], [time - seconds[0] for time in seconds]
+
+
+def _named_times(paths: Sequence[str]) -> list[float]:
+    """Return the times in the names of images, seconds: dates, or the only number; none where not all have one."""
+    for pattern in _TIMES:
+        found = [pattern.search(Path(path).stem) for path in paths]
+        read = [_time_of(*match.groups()) for match in found if match is not None]
+        times = [time for time in read if time is not None]
+        if len(times) == len(paths) and len({*times}) > 1:
+            return times
+    return []
+
+
+def _time_of(whole: str, part: str | None) -> float | None:
+    """Return seconds, or since 1970 of a date; None of a date that there is not."""
+    if len(digits := re.sub(r"\D", "", whole)) == 14:
+        with suppress(ValueError):
+            moment = datetime.strptime(digits, "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+            return moment.timestamp() + float(f"0.{part or 0}")
+        return None
+    return float(f"{whole}.{part or 0}")
 
 
 def _video(

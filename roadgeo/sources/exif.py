@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from datetime import UTC, datetime
+import re
+from datetime import datetime
 
 from roadgeo.errors import MaskError
 from roadgeo.storage.orientation import read_tag
@@ -15,7 +16,7 @@ __all__ = ["number_of", "read_focal_length", "read_metadata", "read_position", "
 FILM_WIDTH_MM = 36.0
 _FOCAL = "EXIF_FocalLengthIn35mmFilm"
 _GPS = 0x8825
-_EXIF, _TAKEN, _PART_OF_SECOND = 0x8769, 0x9003, 0x9291
+_EXIF, _TAKEN, _PART_OF_SECOND, _ZONE = 0x8769, 0x9003, 0x9291, 0x9011
 
 
 def read_focal_length(path: str | os.PathLike[str]) -> float:
@@ -36,10 +37,14 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
 
 
 def read_time(path: str | os.PathLike[str]) -> float | None:
-    """Return when a photograph was taken by its own clock, seconds since 1970; None where EXIF does not give it."""
-    taken, part = (read_tag(path, tag, _EXIF) for tag in (_TAKEN, _PART_OF_SECOND))
+    """Return when a photograph was taken, seconds since 1970; None where EXIF does not give it.
+
+    A clock without a zone counts as UTC.
+    """
+    taken, part, zone = (read_tag(path, tag, _EXIF) for tag in (_TAKEN, _PART_OF_SECOND, _ZONE))
+    zone = zone if isinstance(zone, str) and re.fullmatch(r"[-+]\d\d:\d\d", zone) else "+00:00"
     try:
-        moment = datetime.strptime(str(taken), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        moment = datetime.strptime(f"{taken}{zone}", "%Y:%m:%d %H:%M:%S%z")
     except ValueError:
         return None
     return moment.timestamp() + number_of(f"0.{part or 0}")

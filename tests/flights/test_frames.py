@@ -276,6 +276,36 @@ def test_images_have_the_times_of_exif_where_all_do(
     assert "taken to be 1 s apart" in caplog.text
 
 
+NAMED = {
+    "seconds": (["9.0", "10.0", "10.5", "12.25", "12.5"], [0.0, 1.0, 1.5, 3.25, 3.5]),
+    "before and after": (["t=-1.5s", "t=-0.25s", "t=2.0s"], [0.0, 1.25, 3.5]),
+    "with words": (["frame_000123.45s", "frame_000124.00s", "frame_000126.5s"], [0.0, 0.55, 3.05]),
+    "since 1970": (["1699999999.123", "1699999999.456", "1700000001.5"], [0.0, 0.333, 2.377]),
+    "milliseconds": (["1699999999123", "1699999999623", "1700000001123"], [0.0, 0.5, 2.0]),
+    "nanoseconds": (["cam0_1403636579763555584", "cam0_1403636579813555456"], [0.0, 0.05]),
+    "dates": (["20240611_235958", "20240611_235959", "20240612_000001"], [0.0, 1.0, 3.0]),
+    "dates and numbers": ([f"DJI_2024061110450{k}_000{n}_V" for n, k in enumerate("1337")], [0.0, 2.0, 2.5, 6.0]),
+    "dates as ISO has them": (["2024-06-11T10-45-01.250", "2024-06-11T10-45-03.000"], [0.0, 1.75]),
+    "numbers": (["frame_1", "frame_2", "frame_7"], [0.0, 1.0, 2.0]),
+    "one has none": (["1.5", "2.0", "last"], [0.0, 1.0, 2.0]),
+    "no dates": (["20241399_104501", "20241399_104509"], [0.0, 1.0]),
+}
+
+
+@pytest.mark.parametrize("kind", NAMED)
+@pytest.mark.parametrize("suffix", ["png", "jpg", "TIF"])
+def test_images_have_the_times_of_their_names_where_all_do(
+    kind: str, suffix: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names, times = NAMED[kind]
+    for name in names:
+        PIL.Image.fromarray(streets()).save(tmp_path / f"{name}.{suffix}")
+    read = list(read_frames([str(tmp_path)]))
+    assert [frame.name for frame in read] == [f"{name}.{suffix}" for name in names]
+    assert [frame.time_s for frame in read] == pytest.approx(times, abs=1e-3)
+    assert ("stand in their names" in caplog.text) == ("1 s apart" not in caplog.text)
+
+
 def test_a_video_is_known_by_its_content_too(tmp_path: Path) -> None:
     writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 2.0, (320, 240))
     for _ in range(3):

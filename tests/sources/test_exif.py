@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from roadgeo.cli import cli
 from roadgeo.errors import MaskError
-from roadgeo.sources.exif import read_focal_length, read_position
+from roadgeo.sources.exif import read_focal_length, read_position, read_time
 from roadgeo.sources.georeference import read_stated_middle
 
 
@@ -60,3 +60,12 @@ def test_the_camera_says_where_it_is(tmp_path, suffix, stated, place):
     for read in (read_position, read_stated_middle):
         found = read(tmp_path / f"a.{suffix}")
         assert found == (None if place is None else pytest.approx(place, abs=1e-6))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize(("zone", "hours"), [("", 0), ("+02:00", -2), ("-03:30", 3.5), ("   :  ", 0)])
+def test_clocks_that_are_put_back_do_not_go_back(tmp_path, suffix, zone, hours):
+    exif = PIL.Image.Exif()
+    exif[PIL.ExifTags.IFD.Exif] = {0x9003: "2024:10:27 02:30:00", **({0x9011: zone} if zone else {})}
+    PIL.Image.new("L", (90, 60)).save(tmp_path / f"a.{suffix}", exif=exif)
+    assert read_time(tmp_path / f"a.{suffix}") == 1729996200 + 3600 * hours
