@@ -74,6 +74,7 @@ _EXPECTED = (
 )
 
 
+@each_bounded
 def stream_tables(
     path: Path,
     layer: str | Sequence[str] | None,
@@ -101,18 +102,6 @@ def stream_tables(
     RoadSourceError
         The file is unreadable, or which of its layers is meant is not known.
     """
-    yield from each_bounded(path, _stream(path, layer, most, advance, folder, areas=areas))
-
-
-def _stream(
-    path: Path,
-    layer: str | Sequence[str] | None,
-    most: int,
-    advance: Callable[[float], None],
-    folder: Path,
-    *,
-    areas: bool,
-) -> Iterator[RoadTable]:
     name = path.name.lower()
     if why := _ELSEWHERE.get(path.suffix.lower()) or _what_is_wrong(path):
         raise RoadSourceError(f"{path}: {why}")

@@ -7,9 +7,10 @@ import ctypes
 import mmap
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from roadgeo.storage.fence import is_inside
 
 __all__ = ["MEMORY", "bounded", "each_bounded", "give_back_memory", "let_pages_go"]
 
+_P = ParamSpec("_P")
 _Part = TypeVar("_Part")
 
 #: Variable that states how much memory the reading of a file may take, GB.
@@ -65,15 +67,22 @@ def bounded(path: str | os.PathLike[str], before: int | None = None) -> Iterator
         resource.setrlimit(resource.RLIMIT_DATA, (kept, hard))
 
 
-def each_bounded(path: str | os.PathLike[str], parts: Iterable[_Part]) -> Iterator[_Part]:
-    """Yield the parts of a file, which are read within one bound on memory (see `bounded`), with all that is kept."""
-    before, rest = _held_bytes(), iter(parts)
-    while True:
-        with bounded(path, before):
-            part = next(rest, None)
-        if part is None:
-            return
-        yield part
+def each_bounded(
+    read: Callable[Concatenate[Path, _P], Iterator[_Part]],
+) -> Callable[Concatenate[Path, _P], Iterator[_Part]]:
+    """Have a reader read the parts of a file within one bound on memory (see `bounded`), with all that is kept."""
+
+    @wraps(read)
+    def read_bounded(path: Path, /, *args: _P.args, **kwargs: _P.kwargs) -> Iterator[_Part]:
+        before, rest = _held_bytes(), read(path, *args, **kwargs)
+        while True:
+            with bounded(path, before):
+                part = next(rest, None)
+            if part is None:
+                return
+            yield part
+
+    return read_bounded
 
 
 def _allowance(path: str | os.PathLike[str]) -> int:
