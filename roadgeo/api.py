@@ -123,7 +123,12 @@ def fence(read: Files = (), write: Files = (), *, network: bool = False) -> bool
 
 def _paths(given: Files) -> tuple[str, ...]:
     one = (given,) if isinstance(given, str | os.PathLike) else given
-    return tuple(os.fspath(path) for path in one)
+    try:
+        return tuple(os.fspath(path) for path in one)
+    except TypeError as error:
+        raise TypeError(
+            f"{type(given).__name__} is no path, nor several; expected files, folders or patterns"
+        ) from error
 
 
 def index(
@@ -351,7 +356,7 @@ def track(
     motion: str | os.PathLike[str] | None = None,
     unordered: bool = False,
     every: float = 1.0,
-    interval: float = 1.0,
+    interval: float | None = None,
     start: datetime | None = None,
     focal: float | None = None,
     **hints: Unpack[FlightHints],
@@ -373,7 +378,8 @@ def track(
     unordered : bool
         The frames are in no order: all are solved together.
     every, interval : float
-        Seconds between the frames that are taken of a video, and between images.
+        Seconds between the frames that are taken of a video, and between images: by default as EXIF or their names
+        state it, where all of them have times, else 1.
     start : datetime
         When the first frame was taken.
     focal : float
@@ -401,7 +407,7 @@ def track(
     options = TrackOptions(locate=_with_hints(LocateOptions(), {"time_limit": 10.0, **hints}, None))
     moved = None if motion is None else read_motion(os.fspath(motion))
     reading = FrameOptions(gsd_m=_hint("gsd", hints.get("gsd")), motion=moved, every_s=every, interval_s=interval)
-    paths = [os.fspath(frame) for frame in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
+    paths = _paths(frames)
     opened: Any = _open(reference)
     tracked = latest(follow_frames(paths, reading, opened, options, unordered))
     if not tracked:

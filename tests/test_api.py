@@ -232,3 +232,16 @@ def test_the_advice_of_a_refusal_names_keywords(porto: roadgeo.Reference) -> Non
 def test_what_is_no_picture_is_none_for_a_type_checker() -> None:
     assert inspect.signature(roadgeo.locate).parameters["mask"].annotation == "Picture | RoadMask"
     assert inspect.signature(roadgeo.vectorize).parameters["image"].annotation == "Picture"
+
+
+@pytest.mark.parametrize("frames", [3.14, None, ["a.png", 3], [np.zeros((40, 40))]])
+def test_a_flight_is_of_files(porto, frames):
+    with pytest.raises(TypeError, match=r"is no path, nor several; expected files, folders or patterns"):
+        roadgeo.track(frames, porto)
+
+
+def test_frames_have_their_own_times_unless_told(porto, tmp_path):
+    for name in ("1.5.png", "2.0.png", "4.5.png"):
+        Image.new("L", (90, 60)).save(tmp_path / name)
+    assert [row.time_s for row in roadgeo.track(tmp_path, porto)] == [0.0, 0.5, 3.0]
+    assert [row.time_s for row in roadgeo.track(tmp_path, porto, interval=2.0)] == [0.0, 2.0, 4.0]

@@ -91,6 +91,7 @@ _DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE, _OLD_SUBFILE_TYPE = 50706, 330, 254, 255
 _IN_PART = 0b101  # bits of a type: a reduced picture, a mask of transparency
 _CANON = b"CR"  # at byte 8
 _PAGE = re.compile(r"GTIFF_DIR:(\d+):(.+)", re.DOTALL)  # GDAL's name of a page
+_STILL = re.compile(rb"(?s)....ftyp(?:hei|hev|mif1|msf1|avi)")  # HEIC and AVIF
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
@@ -273,9 +274,10 @@ _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jp2", ".bmp", ".
 
 
 def is_raster(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as a format that is read here."""
+    """Whether a file begins as a picture, of a format that is read here or as phones take them."""
     with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-        return _driver_of(file.read(_HEAD_BYTES)) is not None
+        head = file.read(_HEAD_BYTES)
+    return _driver_of(head) is not None or _STILL.match(head) is not None
 
 
 def _driver_of(head: bytes) -> str | None:
@@ -305,6 +307,8 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             raise MaskError(
                 f"{name}: is text, whatever its name says; expected an image of a format that is read ({_NAMES})"
             )
+        if _STILL.match(head):
+            raise MaskError(f"{name}: a picture in HEIC or AVIF, which is not read; save it as JPEG or TIFF")
         raise MaskError(
             f"{name}: not a raster of a format that is read here ({_NAMES}); convert it to GeoTIFF (of a video "
             f"`roadgeo track` takes frames), or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"

@@ -28,7 +28,15 @@ from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import name_page, open_raster, page_of, raster_size, sidecar_nodata, writing_raster
+from roadgeo.storage.rasters import (
+    is_raster,
+    name_page,
+    open_raster,
+    page_of,
+    raster_size,
+    sidecar_nodata,
+    writing_raster,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -535,3 +543,13 @@ def test_an_empty_file_is_called_so(tmp_path: Path, read, suffix: str) -> None:
     (tmp_path / f"a.{suffix}").touch()
     with pytest.raises(MaskError, match="is empty"):
         read(tmp_path / f"a.{suffix}")
+
+
+@pytest.mark.parametrize("brand", [b"heic", b"heix", b"mif1", b"avif", b"avis"])
+@pytest.mark.parametrize("name", ["a.HEIC", "a.jpg", "a.avif", "a"])
+def test_pictures_of_phones_that_are_not_read_are_named(tmp_path: Path, brand: bytes, name: str) -> None:
+    (tmp_path / name).write_bytes(b"\0\0\0\x18ftyp" + brand + b"\0\0\0\0mif1" + bytes(4000))
+    assert is_raster(tmp_path / name)  # and no video
+    message = "a picture in HEIC or AVIF, which is not read; save it as JPEG or TIFF"
+    with pytest.raises(MaskError, match=message), open_raster(tmp_path / name):
+        pass
