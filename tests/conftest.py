@@ -41,6 +41,7 @@ NIGHTLY = (
     "tests/cli/test_fence.py",
     "tests/cli/test_traces.py",
     "tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/",
+    "tests/docs/test_docs.py::test_the_commands_for_qgis",
     "tests/examples/",
     "tests/outputs/test_page_widths.py",
     "tests/qgis/",
