@@ -15,6 +15,7 @@ from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.placement import Matches, Placement
+from roadgeo.geometry.projection import metres_apart
 from roadgeo.geometry.similarity import find_similarity
 from roadgeo.location import Content, Location, Reason, Spent, Stats
 from roadgeo.matching.index import ReferenceIndex
@@ -253,7 +254,12 @@ def _refuse(
 def _fits_elsewhere(location: Location, listed: Sequence[Place], options: LocateOptions) -> Location:
     """Refuse what hints led to: the first of the places, which they exclude, explains more."""
     better, *hinted = listed
-    where = f"{away(better.apart_m(hinted[0]))} away" if hinted else "elsewhere"
+    if hinted and hinted[0].score >= options.min_log10_odds:
+        where = f"{away(better.apart_m(hinted[0]))} away"
+    elif options.near is not None:
+        where = f"{away(metres_apart(better.lonlat, np.array(options.near[:2])))} away"
+    else:
+        where = f"on {better.index.name}"
     ways = broken_hints(better, options)
     reason = f"the roads fit better {where}, {', and '.join(ways)}" if ways else f"the roads fit better {where}"
     return replace(_at(location, listed, None, options), reason=reason, reason_code=Reason.FITS_ELSEWHERE)

@@ -80,7 +80,7 @@ def locate_passes(
     options: LocateOptions,
     how: Locate,
 ) -> Sighting:
-    """Take one pass after another until a mask is located or the map is empty there, within the limits of one search.
+    """Take one pass after another until one settles the search, within the limits of one search.
 
     Parameters
     ----------
@@ -113,11 +113,21 @@ def locate_passes(
         time_left -= seconds.vectorize + seconds.match + seconds.refine
         location = _discount(location, roads.what, tried, options)
         sightings.append(Sighting(location, roads.mask, explanation, roads.probability))
-        if sightings[-1].location.located or location.reason_code is Reason.FEW_NEAR:  # which others find, too
+        if _is_settled(sightings[-1].location, options):
             break
     if not sightings:
         raise failure or MaskError("nothing to look at; give a mask or a photograph")
     return _best_of(sightings)
+
+
+def _is_settled(location: Location, options: LocateOptions) -> bool:
+    """Whether no other pass is needed: a place is located, or the map has none where the hints put it.
+
+    It has none where it has no intersections there, or where the roads fit far better elsewhere.
+    """
+    if location.reason_code is Reason.FITS_ELSEWHERE:
+        return location.places[0].score >= 2.0 * options.min_log10_odds
+    return location.located or location.reason_code is Reason.FEW_NEAR
 
 
 def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -> LocateOptions:

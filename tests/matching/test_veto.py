@@ -11,7 +11,7 @@ from roadgeo.errors import Reason
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.location import Seconds
+from roadgeo.location import Location, Seconds
 from roadgeo.matching import veto
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Searched, search_references
@@ -20,7 +20,7 @@ from roadgeo.matching.parts import Whole
 from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query
 from roadgeo.matching.shifts import Shift, move_about, shifted
-from roadgeo.matching.verdict import decide
+from roadgeo.matching.verdict import _fits_elsewhere, decide
 
 TRUTH = camera((1000, 1000), (1000, 1000), 1.0, 0.0, 0.0, 0.0)
 
@@ -72,6 +72,24 @@ def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_
     away = "the roads fit better (299|300) m away, outside the circle given: leave --near out"
     assert re.fullmatch(away, location.reason)
     assert np.allclose(location.places[0].center[2:], best.lonlat, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("score", "near_m", "where"),
+    [
+        (9.0, 450.0, "(299|300) m away"),  # from the place that hints led to
+        (1.0, 450.0, "(449|450) m away"),  # from the middle of the circle
+        (9.0, None, "(299|300) m away"),
+        (1.0, None, "on town 21"),
+    ],
+)
+def test_a_refusal_says_how_far_away_the_roads_fit_better(town, score, near_m, where):
+    query, index = town
+    options = LocateOptions() if near_m is None else hinted(town, near_m)
+    (best, *_) = found(town, hinted(town))
+    wrong = Place(query.scene, index, shifted(best.matrix, 300.0, 0.0)).but(score=score)
+    location = _fits_elsewhere(Location("q", "not_located", ""), [best, wrong], options)
+    assert re.match(f"the roads fit better {where}", location.reason)
 
 
 def test_a_place_that_agrees_with_the_hints_and_that_they_led_past_is_the_answer(town):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from worlds.answers import moved, placed
 
-from roadgeo.errors import MaskError, Reason
+from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location, Spent, Stats
+from roadgeo.location import Location, Reason, Spent, Stats
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running.passes import PassRoads, locate_passes
 
@@ -62,6 +62,14 @@ def test_a_place_where_the_map_has_nothing_is_no_place_for_other_passes():
     location, limits = take(nothing, found(odds=30.0))
     assert location.reason == "0 intersections"
     assert limits == [6.0]
+
+
+@pytest.mark.parametrize(("lead", "n_passes"), [(6.9, 2), (7.0, 1)])
+def test_where_the_roads_fit_far_better_elsewhere_no_other_pass_is_taken(lead, n_passes):
+    elsewhere = replace(found(odds=lead), status="not_located", reason_code=Reason.FITS_ELSEWHERE)
+    location, limits = take(elsewhere, found("not_located"))
+    assert location.reason_code is Reason.FITS_ELSEWHERE
+    assert len(limits) == n_passes
 
 
 def test_what_is_too_unlikely_for_a_second_pass_is_refused():
