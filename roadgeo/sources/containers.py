@@ -149,17 +149,13 @@ def _stream_gdal(
     parts = _choose_parts(path, asked, areas=areas)
     for n, (held, column, levels) in enumerate(parts):
         total, columns, hint = _choose_columns(path, held)
-        part = what_is_missing(path, total)
+        part, more = what_is_missing(path, total), [column] * (column not in ("", *columns))
+        layers, limit = ", ".join(levels or [one.layer for one in parts]), most if total > most else None
         for skip in range(0, max(total, 1), most):
-            more = [column] * (column not in ("", *columns))
-            data = read_layer(path, held, [*columns, *more], skip, most if total > most else None)
-            meta = {
-                "format": data.driver,
-                "layer": ", ".join(levels or [one.layer for one in parts]),
-                **data.notes,
-            }
+            data = read_layer(path, held, [*columns, *more], skip, limit)
+            meta = {"format": data.driver, "layer": layers, **data.notes}
             if data.shapes is None or data.driver == "CSV":  # GDAL knows one name of a column of shapes
-                yield _undeclared(path, held, skip, most if total > most else None, meta)
+                yield _undeclared(path, held, skip, limit, meta)
                 continue
             if len(data.shapes) < min(most, total - skip):
                 raise RoadSourceError(
