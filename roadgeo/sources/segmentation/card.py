@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from roadgeo._text import listed
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
 
@@ -22,7 +23,7 @@ __all__ = ["TILE_STEP", "ModelCard", "channels_come_last", "read_card", "size_of
 _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
 #: Free input sizes are made multiples of this, as encoders with five reductions ask for.
 TILE_STEP = 32
-_DEFAULT_TILE, _MAX_TILE = 512, 4096
+_DEFAULT_TILE, _MAX_TILE, _MOST_LISTED = 512, 4096, 100
 
 #: Numbers that a model may take, and those that it may give as probabilities or logits; whole ones may be classes.
 _TAKEN = ("float32", "float16", "float64", "uint8")
@@ -200,10 +201,10 @@ def _choose(output: Port, gives_classes: bool, names: dict[int, str], class_name
     else:
         fits = bool(wanted) and (n is None or max(wanted) < n)
     if not fits:
-        listed = ", ".join(f"{key} {name}" for key, name in sorted(names.items())) or "none"
+        held = listed([f"{key} {name}" for key, name in sorted(names.items())], _MOST_LISTED) or "none"
         what = "names no class after roads" if class_name is None else f"has no class {class_name!r}"
         hint = "say which shows them" if class_name is None else "choose one of them"
-        raise ModelError(f"{what} (its classes: {listed}); {hint}: --class NAME")
+        raise ModelError(f"{what} (its classes: {held}); {hint}: --class NAME")
     return tuple(wanted)
 
 
@@ -228,12 +229,7 @@ def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
 
 
 def _classes(names: Any) -> dict[int, str]:
-    classes = {
-        int(key): str(name) for key, name in (names if isinstance(names, dict) else dict(enumerate(names))).items()
-    }
-    if len(classes) > 1000:
-        raise ValueError(f"{len(classes)} classes")
-    return classes
+    return {int(key): str(name) for key, name in (names.items() if isinstance(names, dict) else enumerate(names))}
 
 
 def _read_sidecar(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, Float32Array
-from roadgeo._text import visible
+from roadgeo._text import listed, visible
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.card import TILE_STEP, ModelCard, channels_come_last, read_card, size_of
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, open_onnx
@@ -118,8 +118,8 @@ class Network:
         if not roads:
             held = np.unique(classes[classes != 0])
             if len(held) > 1:
-                listed = ", ".join(f"{item:g}" for item in held[:10])
-                raise ModelError(f"{self.name}: gives the classes {listed}; choose the road: --class NUMBER")
+                numbers = listed([f"{item:g}" for item in held])
+                raise ModelError(f"{self.name}: gives the classes {numbers}; choose the road: --class NUMBER")
             return np.asarray(classes != 0, np.float32)
         return np.asarray(np.isin(classes, roads), np.float32)
 
