@@ -30,6 +30,7 @@ from roadgeo.running.queries import locate_query
 from roadgeo.running.tasks import Task
 from roadgeo.running.variants import Variant
 from roadgeo.sources.georeference import read_georeference
+from roadgeo.storage.crs import known_crs
 
 if TYPE_CHECKING:
     from roadgeo.reference.opening import AnyReference
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 __all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image"]
 
 SCHEMA = "roadgeo.verification/1"
+
+_TODAYS_M = 6378137.0  # half of the long axis of GRS 80 and WGS 84
 
 
 @dataclass(frozen=True)
@@ -117,9 +120,14 @@ def _best(image: _Image, references: Sequence[Reference]) -> Verified:
 
 
 def _inexact(place: Georeference, reference: Reference) -> float:
-    """Return how exactly PROJ takes an image's CRS to a map's, metres; 0 where it does not know."""
+    """Return how exactly PROJ takes an image's CRS to a map's, metres; infinity where a datum has no name and no shift.
+
+    0 where it does not know otherwise: the shift is the file's own, or the ellipsoid that of all datums of today.
+    """
     stated_m = exactness(place.crs, reference.index.plane.crs, place.middle()).sigma_m
-    return 0.0 if math.isnan(stated_m) else stated_m
+    own = known_crs(place.crs)
+    is_todays = own.ellipsoid is not None and own.ellipsoid.semi_major_metre == _TODAYS_M
+    return stated_m if math.isfinite(stated_m) else 0.0 if own.is_bound or is_todays else math.inf
 
 
 def _allow_for_crs(checked: Checked, image: _Image, reference: Reference) -> Checked:
@@ -131,7 +139,8 @@ def _allow_for_crs(checked: Checked, image: _Image, reference: Reference) -> Che
     if offset.over(corners) - math.hypot(offset.sigma_over(corners), inexact) > image.settings.options.tolerance_m:
         return checked
     crs = image.place.crs if len(image.place.crs) < 20 else "the image's CRS"
-    reason = f"{checked.reason}: that may be the way from {crs} to the map's, which PROJ knows to {inexact:g} m only"
+    known = f"knows to {inexact:g} m only" if math.isfinite(inexact) else "does not know"
+    reason = f"{checked.reason}: that may be the way from {crs} to the map's, which PROJ {known}"
     return replace(checked, verdict="unknown", reason=reason)
 
 
@@ -234,8 +243,9 @@ def _to_dict(
 ) -> dict[str, float]:
     """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid.
 
-    `inexact`: metres to which the image's CRS is taken to the plane's.
+    `inexact`: metres to which the image's CRS is taken to the plane's, as far as that is known.
     """
+    inexact = inexact if math.isfinite(inexact) else 0.0
     turn = math.radians(grid_north(plane, plane.to_crs(displacement.about)))
     east = displacement.east_m * math.cos(turn) + displacement.north_m * math.sin(turn)
     north = displacement.north_m * math.cos(turn) - displacement.east_m * math.sin(turn)

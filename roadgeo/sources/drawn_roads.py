@@ -134,4 +134,7 @@ def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixe
             return "degrees"
     if high[1] <= 0:
         return "pixels"
-    raise MaskError(f"{name}: does not say what its coordinates are; give --units pixels or --units metres")
+    raise MaskError(
+        f"{name}: does not say what its coordinates are; give --units pixels or --units metres, or save degrees with "
+        "their CRS, as GeoPackage"
+    )

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import jsonschema
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from worlds.demo import MASKS
@@ -100,6 +101,41 @@ def test_a_raster_that_is_to_be_turned_lies_where_its_stored_pixels_do(porto: Pa
             moved = np.array(raster.transform).reshape(3, 3) - before
         assert moved[:2, 2] == pytest.approx((-40.0, -10.0), abs=3.0)
         assert main(["verify", name, "-r", str(porto), "-q"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("datum", "verdict"),
+    [
+        ("+ellps=intl", "unknown"),
+        ("+ellps=bessel", "unknown"),
+        ("+ellps=intl +towgs84=-87,-98,-121", "off"),
+        ("+ellps=GRS80", "off"),
+        ("+datum=WGS84", "off"),
+    ],
+)
+@pytest.mark.parametrize("where", ["geotransform", "prj"])
+def test_what_may_be_the_shift_of_a_datum_without_a_name_is_no_wrong_place(
+    porto: Path, datum: str, verdict: str, where: str
+) -> None:
+    path = georeferenced("a.tif", 60, -35)
+    with rasterio.open(path) as raster:
+        values, place = raster.read(1), raster.transform
+    crs = pyproj.CRS(f"+proj=utm +zone=29 {datum} +units=m")
+    to_own = pyproj.Transformer.from_crs(SHEET.crs, crs, always_xy=True)
+    corner = np.array(to_own.transform(place.c, place.f))
+    place = rasterio.Affine(place.a, place.b, corner[0], place.d, place.e, corner[1])
+    if where == "geotransform":
+        path = write_raster("a.tif", values, crs=crs.to_wkt(), transform=place)
+    else:
+        path = Path("a.png")
+        cv2.imwrite("a.png", values)
+        Path("a.prj").write_text(crs.to_wkt("WKT1_GDAL"))
+        x, y = place @ (0.5, 0.5)
+        Path("a.pgw").write_text("\n".join(map(str, (place.a, place.d, place.b, place.e, x, y))))
+    found = roadgeo.verify(path, porto)
+    assert found.verdict == verdict
+    assert ("PROJ does not know" in found.document["reason"]) == (verdict == "unknown")
+    assert (found.corrected is None) == (verdict == "unknown")
 
 
 def test_what_has_no_place_or_is_no_image_is_told_in_a_line(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
