@@ -57,10 +57,13 @@ def take_place(location: Location, taken: Taken, options: LocateOptions | None =
     score = min(places[number - 1].score, places[0].score)
     others = tuple(replace(place, rival=None) for k, place in enumerate(places, 1) if k != number)
     chosen = replace(places[number - 1], score=score, rival=others[0] if others else None)
+    excluded = number == 1 and location.reason_code is Reason.FITS_ELSEWHERE
+    which = f"place {number} of {len(places)}" + ", which the hints exclude" * excluded
+    asked = f", {needed:g} is asked for" * (score < needed)
     return replace(
         location,
         status="chosen",
-        reason=f"chosen by you: place {number} of {len(places)}; the score is {score:z.1f}, {needed:g} is asked for",
+        reason=f"chosen by you: {which}; the score is {score:z.1f}{asked}",
         reason_code=Reason.CHOSEN,
         places=(chosen, *others),
         reference=chosen.reference,

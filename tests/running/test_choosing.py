@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from worlds.answers import placed
 
-from roadgeo.errors import MaskError
+from roadgeo.errors import MaskError, Reason
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Content, Location
 from roadgeo.reference.reference import Reference
-from roadgeo.running.choosing import place_by_points
+from roadgeo.running.choosing import place_by_points, take_place
 
 SIZE = (900, 600)
 PIXELS = np.array([(100.0, 80.0), (820.0, 120.0), (700.0, 540.0), (150.0, 500.0), (450.0, 300.0)])
@@ -23,6 +24,22 @@ def points_of(index, matrix, n):
     mapped = np.c_[PIXELS[:n], np.ones(n)] @ np.array(matrix).T
     lonlat = to_lonlat(index.plane.crs, index.plane.to_crs(mapped[:, :2] / mapped[:, 2:]))
     return np.c_[PIXELS[:n], lonlat]
+
+
+H = np.array([[2.0, 0.0, 500_000.0], [0.0, -2.0, 5_500_000.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (1, Reason.NOTHING_STANDS_OUT, "chosen by you: place 1 of 2; the score is 9.0"),
+        (1, Reason.FITS_ELSEWHERE, "chosen by you: place 1 of 2, which the hints exclude; the score is 9.0"),
+        (2, Reason.FITS_ELSEWHERE, "chosen by you: place 2 of 2; the score is 1.0, 3.5 is asked for"),
+    ],
+)
+def test_a_place_that_is_taken_says_what_spoke_against_it(number, code, said):
+    places = tuple(placed(H, "EPSG:32632", score=score) for score in (9.0, 1.0))
+    assert take_place(Location("q", "not_located", "why", places=places, reason_code=code), number).reason == said
 
 
 LEVEL = [[0.5, 0.1, 100.0], [0.1, -0.5, 300.0], [0.0, 0.0, 1.0]]
