@@ -38,16 +38,15 @@ def print_steps() -> Say:
     if is_set("quiet"):
         return say_nothing
     as_json = os.environ.get("ROADGEO_PROGRESS") == "json"
-    last = "", -1
+    shown: dict[str, int] = {}  # per cent of each step
 
     def say(text: str, share: float | None = None) -> None:
-        nonlocal last
-        if text != last[0]:
+        if text not in shown:
             echo(f"{text} ...", err=True)
-            last = text, -1
-        if as_json and share is not None and int(100 * share) != last[1]:
-            last = text, int(100 * share)
-            _print_json(last[1], 100, text)
+        percent = -1 if share is None else int(100 * share)
+        if as_json and percent not in (-1, shown.get(text)):
+            _print_json(percent, 100, text)
+        shown[text] = percent
 
     return say
 

@@ -21,6 +21,7 @@ def walk(say):
     for k in range(200):
         say("drawing", k / 200)
     say("writing")
+    say("reading")  # another pass
 
 
 @pytest.mark.parametrize(("quiet", "said"), [(False, "reading ...\ndrawing ...\nwriting ...\n"), (True, "")])
