@@ -24,8 +24,11 @@ __all__ = [
 #: Environment variable that names further drivers to allow, for example "VRT" or "VRT,netCDF".
 CONSENT = "ROADGEO_GDAL_DRIVERS"
 
-#: Drivers that reach for the network or write while they read; never of use here.
-_SKIPPED = ("MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "GTI", "PLMOSAIC", "EEDAI", "DAAS")
+#: Drivers that write while they read, or reach for the network; the last two by ways that `NETWORK` does not shut.
+_SKIPPED = (
+    *("MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "GTI", "PLMOSAIC", "EEDAI", "DAAS"),
+    *("netCDF", "Zarr"),
+)
 
 #: Settings that keep GDAL off the network: no remote file has the only name allowed, and nothing answers at port 0.
 NETWORK = {

@@ -150,14 +150,19 @@ def test_what_a_virtual_raster_names_writes_nothing_where_machine_code_is_kept(t
     assert ("virtual raster" if gdal == "loaded" else "not recognized") in done.stdout
 
 
-def test_a_virtual_raster_fetches_nothing_where_connections_are_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "source", ["/vsicurl/{}/a.tif", "ZARR:&quot;/vsicurl/{}/z&quot;", "NETCDF:&quot;{}/a#mode=bytes&quot;:v"]
+)
+def test_a_virtual_raster_fetches_nothing_where_connections_are_made(tmp_path: Path, source: str) -> None:
     """As in a command that asks a server, or where the system cannot forbid connections."""
     (tmp_path / "given").mkdir()
     with counting_server() as (address, asked):
-        virtual(tmp_path / "given", f"/vsicurl/{address}/a.tif")
+        virtual(tmp_path / "given", source.format(address))
         code = VIRTUAL.replace("sys.argv[1])", "sys.argv[1], network=True)")
         command = [sys.executable, "-c", code, str(tmp_path / "given"), "not loaded"]
-        subprocess.run(command, env=surroundings(tmp_path), capture_output=True, check=True, timeout=120)
+        environment = {**surroundings(tmp_path), "no_proxy": "127.0.0.1"}
+        environment.pop("GDAL_SKIP", None)
+        subprocess.run(command, env=environment, capture_output=True, check=True, timeout=120)
     assert asked == []
 
 
