@@ -322,8 +322,10 @@ def _what_may_help(query: Query, listed: Sequence[Place], options: LocateOptions
         left = f"{sum(gap <= most for gap in apart)} of {len(listed)} places"
         known = f"{name} to {precision} {option} would leave {left}" if len(listed) > 1 else f"{name} {option}"
         helps += [known] * lacks
-    helps += ["a search with full effort"] * (options.effort == "quick")
-    return f"{', '.join([*helps, 'more roads in view'])} or another map may help"
+    others = ["a search with full effort"] * (options.effort == "quick") + ["more roads in view"]
+    if len(listed) > 1 and helps:
+        return f"{', '.join(helps)}; {', '.join(others)} or another map may help"
+    return f"{', '.join(helps + others)} or another map may help"
 
 
 def _lead(score: float, needed: float) -> str:
