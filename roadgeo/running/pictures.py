@@ -29,6 +29,9 @@ _SUBFILE_TYPE = 254  # a tag of TIFF
 _ROWS, _DEGREES = {"y", "row", "rows", "lat", "latitude"}, {"lon", "longitude"}
 _COLUMNS = {"x", "column", "col"} | _DEGREES
 
+#: Modes of PIL whose bands are no colours as they are shown, and the ones to convert them to.
+_OTHER_COLOURS = {**dict.fromkeys(("CMYK", "YCbCr", "HSV", "LAB", "RGBX"), "RGB"), "RGBa": "RGBA", "La": "LA"}
+
 #: An axis no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
 
@@ -193,6 +196,10 @@ def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
 def _read_pil(image: Any) -> AnyArray:
     if getattr(image, "tag_v2", {}).get(_SUBFILE_TYPE, 0) & 1:
         _LOG.warning("the picture is a thumbnail by its tags; `seek` the page that you mean, or give the file's path")
+    try:
+        image = image.convert(_OTHER_COLOURS[image.mode]) if image.mode in _OTHER_COLOURS else image
+    except ValueError as error:
+        raise MaskError(f"a picture of PIL's mode {image.mode}; convert it to RGB") from error
     bands = image.getbands()
     if bands[0] == "P" and not are_labels(np.asarray(image)):
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")

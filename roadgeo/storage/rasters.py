@@ -91,6 +91,7 @@ _DNG_VERSION, _SUB_IFDS, _SUBFILE_TYPE, _OLD_SUBFILE_TYPE = 50706, 330, 254, 255
 _IN_PART = 0b101  # bits of a type: a reduced picture, a mask of transparency
 _CANON = b"CR"  # at byte 8
 _PAGE = re.compile(r"GTIFF_DIR:(\d+):(.+)", re.DOTALL)  # GDAL's name of a page
+_BREAKS_OFF = re.compile(r"IReadBlock failed|Premature end|DGifSlurp|Failed to read directory at")  # GDAL's words
 _STILL = re.compile(rb"(?s)....ftyp(?:hei|hev|mif1|msf1|avi)")  # HEIC and AVIF
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
@@ -168,6 +169,8 @@ def open_raster(
         except (RasterioError, CPLE_BaseError) as error:
             reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
             remedied = remedy(reason) or "; give an image or GeoTIFF"
+            if _BREAKS_OFF.search(reason):
+                raise MaskError(f"{name}: damaged or cut short; copy or export it again") from error
             raise MaskError(f"{name}: not a raster that can be read ({reason}){remedied}") from error
 
 

@@ -199,3 +199,19 @@ def test_the_geotransform_of_rioxarray_states_the_shape_of_pixels(crs, turned, w
     data.spatial_ref.attrs.update(stated)
     assert pixels_of(data)["mirror"] == (high > 0)
     assert (pixels_of(data)["aspect"] or 1.0) == pytest.approx(wide / abs(high), rel=1e-2)
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "YCbCr", "HSV", "RGBX", "RGBa"])
+def test_colours_of_pil_are_those_that_it_shows(mode):
+    shown = Image.fromarray(np.full((40, 50, 3), (200, 90, 30), np.uint8))
+    picture = shown.convert("RGBA").convert("RGBa") if mode == "RGBa" else shown.convert(mode)
+    assert np.abs(read_picture(picture).astype(int) - (200, 90, 30)).max() <= 5
+
+
+def test_colours_that_pil_does_not_show_are_refused(monkeypatch):
+    def refuse(*_):
+        raise ValueError("conversion from LAB to RGB not supported")  # before Pillow 12
+
+    monkeypatch.setattr(Image.Image, "convert", refuse)
+    with pytest.raises(MaskError, match="mode LAB; convert it to RGB"):
+        read_picture(Image.new("LAB", (50, 40)))

@@ -270,7 +270,7 @@ def test_what_goes_wrong_inside_gdal_is_told_in_a_line(tmp_path, roads):
     content = bytearray(path.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 2000] = bytes(2000)
     path.write_bytes(content)
-    with pytest.raises(MaskError, match="not a raster that can be read"):
+    with pytest.raises(MaskError, match="damaged or cut short"):
         read_mask(path)
 
 
@@ -553,3 +553,20 @@ def test_pictures_of_phones_that_are_not_read_are_named(tmp_path: Path, brand: b
     message = "a picture in HEIC or AVIF, which is not read; save it as JPEG or TIFF"
     with pytest.raises(MaskError, match=message), open_raster(tmp_path / name):
         pass
+
+
+CUT = {
+    **{f"a.{suffix}": {} for suffix in ("png", "jpg", "bmp", "gif", "jp2", "tif", "pgm", "ppm")},
+    **{f"{kind}.tif": {"compression": kind} for kind in ("tiff_lzw", "jpeg", "tiff_deflate")},
+}
+
+
+@pytest.mark.parametrize("name", CUT)
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_pictures_that_are_cut_off_say_so_in_plain_words(tmp_path: Path, name: str, share: float) -> None:
+    path = tmp_path / name
+    PIL.Image.fromarray(np.random.default_rng(0).integers(0, 255, (300, 300), np.uint8)).save(path, **CUT[name])
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    message = r"damaged or cut short; copy or export it again$"
+    with pytest.raises(MaskError, match=message), open_raster(path) as raster:
+        raster.read()
