@@ -1,6 +1,7 @@
 """Numbers that pages take from results are those of the results that are kept; others stand beside their command."""
 
 import csv
+import json
 import re
 from statistics import median
 
@@ -41,6 +42,8 @@ FLIGHTS, VERIFIED, PHOTOGRAPHS = (
     for name in ("results/faulty_flights", "verify/results/grids_seed77", "photographs/results/photographs")
 )
 COST = {row["what"]: row for row in kept("scale/results/cost.csv")}
+FIGURE_7 = json.loads((ROOT / "examples/paper/results/boston/figure7.json").read_text(encoding="utf-8"))
+OF_TYPES = [of_type["tuples"] for of_type in FIGURE_7["types"]]
 BESIDE = [row for row in VERIFIED if 0.0 <= float(row["off_m"]) <= 100.0]
 
 
@@ -115,6 +118,14 @@ FROM_RESULTS = [
         "docs/scale.md",
         r"6\.8 s \| ([\d.]+) GB.* 24 s \| ([\d.]+) GB",
         [digits(int(COST[name]["memory_mb"]) / 1000) for name in ("atlas in shards", "atlas and nine maps made of it")],
+    ),
+    ("docs/paper.md", r"in ([\d.]+) s for the ([\d,]+) tuples", (round(FIGURE_7["build_s"], 1), sum(OF_TYPES))),
+    ("examples/paper/README.md", r"built in ([\d.]+) s", round(FIGURE_7["build_s"], 1)),
+    ("examples/paper/README.md", r"square has ([\d,]+) tuples of (\d+) types", (sum(OF_TYPES), len(OF_TYPES))),
+    (
+        "examples/paper/README.md",
+        r"hold (\d+) %, four hold (\d+) %, and (\d+) types have fewer",
+        (*(round(100 * sum(OF_TYPES[:most]) / sum(OF_TYPES)) for most in (2, 4)), sum(n < 100 for n in OF_TYPES)),
     ),
     ("docs/commands/track.md", r"(\d+) flights cross the grids", len(FLIGHTS)),
     (
