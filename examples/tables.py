@@ -1,7 +1,7 @@
-"""Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
+"""Write the tables of docs/how-well.md from the results that are kept: python examples/tables.py.
 
-BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
-The bands of the score are the same as in `error_rate` of a result. The other tables count the searches that
+`results/bench.json` is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one
+counts. The bands of the score are the same as in `error_rate` of a result. The other tables count the searches that
 `examples/trust`, `examples/photographs`, `examples/company` and `examples/peers` keep in their `results`. `--check`
 writes nothing, and fails if a table would change.
 """
@@ -30,6 +30,7 @@ import results  # noqa: E402
 from roadgeo.location import ERROR_RATES  # noqa: E402
 
 PAGE = EXAMPLES.parent / "docs" / "how-well.md"
+BENCH = EXAMPLES / "results" / "bench.json"
 SEARCHES = EXAMPLES / "trust" / "results"
 #: A place is reported from this score on.
 NEEDED = 3.5
@@ -137,12 +138,10 @@ def put(page: str, name: str, lines: Iterator[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it the other tables")
     parser.add_argument("--check", action="store_true")
     options = parser.parse_args(arguments)
     before = page = PAGE.read_text(encoding="utf-8")
-    if options.bench:
-        page = put(page, "bench", bench_table(json.loads(options.bench.read_text(encoding="utf-8"))))
+    page = put(page, "bench", bench_table(json.loads(BENCH.read_text(encoding="utf-8"))))
     tables = {"worn": worn_table, "photographs": photographs_table, "company": company_table}
     tables |= {"peers": peers_table, "trust": trust_table}
     for name, table in tables.items():

@@ -164,7 +164,12 @@ FROM_RESULTS = [
 
 #: Page; what it says; what another page says, whose numbers are the same.
 FROM_PAGES = [
-    ("README.md", r"steep views \| (\d+) of (\d+) \| 0 \|", "docs/how-well.md", r"(\d+) of (\d+) masks are located"),
+    (
+        "README.md",
+        r"steep views \| (\d+) of (\d+) \| (\d+) \|",
+        "docs/how-well.md",
+        r"\| all of them \| (\d+) of (\d+) \| (\d+) \|",
+    ),
     ("README.md", r"\| ([\d,]+) of ([\d,]+) \| 3 \|", "docs/how-well.md", r"full effort locates ([\d,]+) of ([\d,]+)"),
     (
         "README.md",
