@@ -68,21 +68,16 @@ class Photograph:
 
     def stretched(self, wide: float, high: float) -> Photograph:
         """Return the same with these numbers of columns and rows for each of its own."""
-
-        def read(
-            left: float, top: float, width: float, height: float, shape: tuple[int, int]
-        ) -> tuple[AnyArray, BoolArray]:
-            return self.read(left / wide, top / high, width / wide, height / high, shape)
-
-        return replace(self, width=round(wide * self.width), height=round(high * self.height), read=read)
+        return replace(
+            self,
+            width=round(wide * self.width),
+            height=round(high * self.height),
+            read=lambda x, y, w, h, shape: self.read(x / wide, y / high, w / wide, h / high, shape),
+        )
 
     def cut(self, left: float, top: float, width: int, height: int) -> Photograph:
         """Return a part of it."""
-
-        def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:
-            return self.read(left + x, top + y, w, h, shape)
-
-        return replace(self, width=width, height=height, read=read)
+        return replace(self, width=width, height=height, read=lambda x, y, *rest: self.read(left + x, top + y, *rest))
 
 
 @contextmanager
