@@ -42,7 +42,10 @@ FLIGHTS, VERIFIED, PHOTOGRAPHS = (
     for name in ("results/faulty_flights", "verify/results/grids_seed77", "photographs/results/photographs")
 )
 COST = {row["what"]: row for row in kept("scale/results/cost.csv")}
-FIGURE_7 = json.loads((ROOT / "examples/paper/results/boston/figure7.json").read_text(encoding="utf-8"))
+FIGURE_7, FIGURE_8 = (
+    json.loads((ROOT / f"examples/paper/results/boston/figure{number}.json").read_text(encoding="utf-8"))
+    for number in (7, 8)
+)
 OF_TYPES = [of_type["tuples"] for of_type in FIGURE_7["types"]]
 BESIDE = [row for row in VERIFIED if 0.0 <= float(row["off_m"]) <= 100.0]
 
@@ -73,6 +76,19 @@ def cost(name):
     row = COST[name]
     masks = [int(row[key]) for key in ("located", "masks", "wrong")]
     return int(row["intersections"]), *masks, digits(float(row["median_s"])), digits(float(row["refusal_s"]))
+
+
+def orders(noise):
+    """Return the places that are right, of how many, and the hypotheses of those located, in both orders of drawing."""
+    rows = [row for row in FIGURE_7["rarest_first"] if row["noise"] == noise]
+    counts = [(row["recall"]["hits"], row["recall"]["of"], row["median_hypotheses_of_located"]) for row in rows]
+    return [round(number) for row in counts for number in row]
+
+
+def within(point):
+    """Return the places that are right, of how many, those that are wrong, the share within 1 s, and the median."""
+    hits, of = point["recall"]["hits"], point["recall"]["of"]
+    return hits, of, point["located"] - hits, 100 * point["within_1_s"], round(np.sort(point["seconds"])[of // 2], 2)
 
 
 ROW = r" \| ([\d,]+) \|[ \d]*\| (\d+) of (\d+); (\d+) \| ([\d.]+) s \| ([\d.]+) s \|"
@@ -126,6 +142,18 @@ FROM_RESULTS = [
         "examples/paper/README.md",
         r"hold (\d+) %, four hold (\d+) %, and (\d+) types have fewer",
         (*(round(100 * sum(OF_TYPES[:most]) / sum(OF_TYPES)) for most in (2, 4)), sum(n < 100 for n in OF_TYPES)),
+    ),
+    *(
+        ("examples/paper/README.md", rf"\| {noise} " + 2 * r"\| (\d+) of (\d+), ([\d,]+) ", orders(noise))
+        for noise in ("clean", "segmented")
+    ),
+    *(
+        (
+            "examples/paper/README.md",
+            rf"\| {point['name']} \| (\d+) of (\d+) \| (\d+) \| (\d+) % \| ([\d.]+) s",
+            within(point),
+        )
+        for point in FIGURE_8["points"]
     ),
     ("docs/commands/track.md", r"(\d+) flights cross the grids", len(FLIGHTS)),
     (
