@@ -7,6 +7,7 @@ the network, and one (MRF) writes to a path in the file. Rasterio and pyogrio ea
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 __all__ = [
@@ -19,16 +20,16 @@ __all__ = [
     "forget_missing_proj_data",
     "is_named_remote",
     "skip_drivers",
+    "skipping",
 ]
 
 #: Environment variable that names further drivers to allow, for example "VRT" or "VRT,netCDF".
 CONSENT = "ROADGEO_GDAL_DRIVERS"
 
-#: Drivers that write while they read, or reach for the network; the last two by ways that `NETWORK` does not shut.
-_SKIPPED = (
-    *("MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "GTI", "PLMOSAIC", "EEDAI", "DAAS"),
-    *("netCDF", "Zarr"),
-)
+#: Drivers that write while they read, or reach for the network.
+_SKIPPED = ("MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "GTI", "PLMOSAIC", "EEDAI", "DAAS", "Zarr")
+#: By rasterio's GDAL, too; those that lack it would complain. `NETWORK` does not shut it.
+_SKIPPED_BY_RASTERIO = (*_SKIPPED, "netCDF")
 
 #: Settings that keep GDAL off the network: no remote file has the only name allowed, and nothing answers at port 0.
 NETWORK = {
@@ -49,19 +50,30 @@ def skip_drivers() -> None:
 
     Programs that merely use roadgeo keep their drivers; `storage.rasters` and `storage.vectors` guard each file.
     """
+    os.environ["GDAL_SKIP"] = _skipped(_SKIPPED)
+
+
+def skipping() -> dict[str, str]:
+    """Return the setting by which rasterio's GDAL leaves out one more, where `skip_drivers` was called."""
+    if os.environ.get("GDAL_SKIP", "") != _skipped(_SKIPPED):
+        return {}
+    return {"GDAL_SKIP": _skipped(_SKIPPED_BY_RASTERIO)}
+
+
+def _skipped(drivers: Sequence[str]) -> str:
+    """Return the value of GDAL_SKIP with further drivers, less those that the user allows."""
     given = os.environ.get("GDAL_SKIP", "")
     before = (name.strip() for name in (given.split(",") if "," in given else given.split()))
     kept = set(allowed_drivers())
-    names = dict.fromkeys(name for name in (*before, *_SKIPPED) if name and name not in kept)
-    os.environ["GDAL_SKIP"] = ",".join(names)
+    return ",".join(dict.fromkeys(name for name in (*before, *drivers) if name and name not in kept))
 
 
 def are_skipped() -> bool:
     """Whether rasterio's GDAL lacks its dangerous drivers: it takes any for the files that a virtual raster names."""
     import rasterio
 
-    with rasterio.Env() as env:
-        return not env.drivers().keys() & {*_SKIPPED} - {*allowed_drivers()}
+    with rasterio.Env(**skipping()) as env:
+        return not env.drivers().keys() & {*_SKIPPED_BY_RASTERIO} - {*allowed_drivers()}
 
 
 def forget_missing_proj_data() -> None:

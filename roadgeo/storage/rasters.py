@@ -26,7 +26,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.fence import is_inside, remedy
-from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, is_named_remote
+from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, is_named_remote, skipping
 from roadgeo.storage.orientation import (
     UPRIGHT,
     read_orientation,
@@ -394,6 +394,7 @@ def _opened(path: str, drivers: list[str], may_fetch: bool) -> Iterator[DatasetR
 
     with rasterio.Env(
         GDAL_CACHEMAX=_CACHE_BYTES,
+        **skipping(),
         **{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)},
     ):
         for last, driver in enumerate(drivers, 1 - len(drivers)):

@@ -173,6 +173,13 @@ def test_what_is_no_raster_is_named_inside_too(tmp_path: Path) -> None:
         assert message in roadgeo(tmp_path, "vectorize", name).stderr
 
 
+def test_drivers_that_are_left_out_are_left_out_without_a_word(porto: Path, tmp_path: Path) -> None:
+    shutil.copy(DRONE, tmp_path)
+    for command in (("index", "--roads", str(porto), "--out", "again.gpkg", "-q"), ("vectorize", "drone.png")):
+        done = roadgeo(tmp_path, *command)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_reference_in_another_folder_gets_its_index_there(porto: Path, tmp_path: Path) -> None:
     (tmp_path / "maps").mkdir()
     shutil.copy(porto, tmp_path / "maps")
