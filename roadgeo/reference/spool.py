@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.storage.vectors import load_pyogrio
 
 __all__ = ["Bounds", "Cell", "Spool"]
 
@@ -54,7 +55,7 @@ class Spool:
         OSError
             They cannot be written.
         """
-        import pyogrio
+        pyogrio = load_pyogrio()
         import shapely
 
         if not len(lines):
@@ -97,7 +98,7 @@ class Spool:
         self, wanted: Callable[[AnyArray], BoolArray | bool], box: Bounds | None = None
     ) -> tuple[AnyArray, AnyArray]:
         """Return the wanted lines of all parts that a box touches, and their labels."""
-        import pyogrio
+        pyogrio = load_pyogrio()
         import shapely
 
         lines, texts = [np.empty(0, object)], [np.empty((0, 2), object)]

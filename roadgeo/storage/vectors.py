@@ -8,6 +8,7 @@ other drivers are registered again afterwards, for this may be part of a larger 
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import tempfile
 import threading
@@ -23,7 +24,16 @@ from roadgeo.storage.fence import remedy
 from roadgeo.storage.gdal import CONSENT, NETWORK, OWN_SHIFT, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
-__all__ = ["VectorLayer", "beside", "describe_layer", "first_line", "list_layers", "read_layer", "require_file"]
+__all__ = [
+    "VectorLayer",
+    "beside",
+    "describe_layer",
+    "first_line",
+    "list_layers",
+    "load_pyogrio",
+    "read_layer",
+    "require_file",
+]
 
 #: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
 _DRIVERS = {
@@ -38,6 +48,7 @@ _OWN_TABLES = (
 )
 
 _LOCK = threading.RLock()
+_BREAK = re.compile(r"[\t\r\n]")
 
 
 class VectorLayer(NamedTuple):
@@ -60,6 +71,17 @@ class VectorLayer(NamedTuple):
     notes: dict[str, str]
 
 
+def load_pyogrio() -> Any:
+    """Return pyogrio, loaded without the drivers to leave out: it would print a line for each that its GDAL has not."""
+    given = os.environ.pop("GDAL_SKIP", None)
+    try:
+        import pyogrio
+    finally:
+        if given is not None:
+            os.environ["GDAL_SKIP"] = given
+    return pyogrio
+
+
 def list_layers(path: Path) -> list[tuple[str, str]]:
     """Return the names and geometry types of a file's layers.
 
@@ -68,7 +90,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
     RoadSourceError
         The file cannot be read, or not without opening others.
     """
-    import pyogrio
+    pyogrio = load_pyogrio()
 
     with _guarded(path) as file:
         return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(file)]
@@ -76,7 +98,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
 
 def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
     """Return the number of features that a layer claims to hold, and its columns' names; errors as of `list_layers`."""
-    import pyogrio
+    pyogrio = load_pyogrio()
 
     with _guarded(path, layer) as file:
         info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
@@ -91,7 +113,7 @@ def read_layer(
     The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
     names is read as Latin-1, which may garble it, and that is reported. It raises as `list_layers` does.
     """
-    import pyogrio
+    pyogrio = load_pyogrio()
 
     with _guarded(path) as file:
         layer = layer or str(pyogrio.list_layers(file)[0][0])
@@ -144,25 +166,26 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
 
 @contextmanager
 def _aside(path: Path) -> Iterator[Path]:
-    """Yield a link in a passing folder to a file beside which GDAL writes.
+    """Yield a link in a passing folder to a file beside which GDAL writes, or whose path pyogrio would cut at a break.
 
-    Beside an XML file it does what it found in it, beside a shapefile a new index where that is missing or damaged.
+    Beside an XML file it writes what it found in it, beside a shapefile a new index where that is missing or damaged.
     """
-    import pyogrio
+    pyogrio = load_pyogrio()
 
     is_shapefile = path.suffix.lower() == ".shp" and path.is_file() and not _has_index(path)
-    if not path.is_file() or not (is_shapefile or _head(path)[:1] == b"<"):
+    is_broken = _BREAK.search(str(path.absolute())) is not None
+    if not is_broken and (not path.is_file() or not (is_shapefile or _head(path)[:1] == b"<")):
         yield path
         return
-    files = [file for file in beside(path) if file.suffix.lower() != ".shx"] if is_shapefile else [path]
+    files = [file for file in beside(path) if not (is_shapefile and file.suffix.lower() == ".shx")]
     with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
-        link = Path(folder) / path.name
+        link = Path(folder) / _BREAK.sub("_", path.name)
         try:
             for file in files:
-                (Path(folder) / file.name).symlink_to(file.absolute())
+                (Path(folder) / _BREAK.sub("_", file.name)).symlink_to(file.absolute())
         except OSError:  # no links here (Windows, without leave)
             link = path
-        pyogrio.set_gdal_config_options({"SHAPE_RESTORE_SHX": "YES" if link != path else None})
+        pyogrio.set_gdal_config_options({"SHAPE_RESTORE_SHX": "YES" if is_shapefile and link != path else None})
         try:
             yield link
         finally:
@@ -190,7 +213,7 @@ def _head(path: Path) -> bytes:
 @contextmanager
 def _few_drivers() -> Iterator[None]:
     """Have pyogrio's GDAL know only the drivers above, and those that the user allows."""
-    import pyogrio
+    pyogrio = load_pyogrio()
     from pyogrio import core
 
     with _LOCK:
@@ -203,13 +226,14 @@ def _few_drivers() -> Iterator[None]:
             yield
         finally:
             pyogrio.set_gdal_config_options({"GDAL_SKIP": None if given == os.environ.get("GDAL_SKIP") else given})
-            core._register_drivers()
+            with warnings.catch_warnings(action="ignore"):  # on drivers that its GDAL has not
+                core._register_drivers()
 
 
 @contextmanager
 def _offline() -> Iterator[None]:
     """Let no request of pyogrio's GDAL reach anything; a file's own datum shift stays."""
-    import pyogrio
+    pyogrio = load_pyogrio()
 
     # Blocks of a drawing within blocks have no end.
     options = {**NETWORK, **OWN_SHIFT, "GML_DOWNLOAD_SCHEMA": "NO", "DXF_INLINE_BLOCKS": "NO"}

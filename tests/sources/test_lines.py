@@ -347,6 +347,16 @@ def test_a_shapefile_whose_index_is_lost_is_read_and_nothing_is_written_beside_i
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".geojson", ".fgb", ".gml"])
+@pytest.mark.parametrize("name", ["a\nb", "a\tb", "Straße 1 道路", "a  b"])
+def test_names_may_hold_anything(tmp_path, name, suffix):
+    (tmp_path / "fol\nder").mkdir()
+    write_streets(tmp_path / f"a{suffix}")
+    for part in [*tmp_path.glob("a.*")]:
+        part.rename(tmp_path / "fol\nder" / f"{name}{part.suffix}")
+    assert len(read_lines(tmp_path / "fol\nder" / f"{name}{suffix}").lines) == len(streets()[0])
+
+
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.7])
 @pytest.mark.parametrize("suffix", [".dbf", ".DBF"])
 def test_a_table_that_is_cut_off_is_no_shapefile_without_kinds(tmp_path, share, suffix):
