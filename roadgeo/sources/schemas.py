@@ -277,11 +277,11 @@ def _tag(values: AnyArray, key: str) -> AnyArray:
 
 
 def _rules(value: Any) -> list[tuple[tuple[float, float] | None, list[str]]]:
-    """Return Overture's flags of a segment: each with the part that it holds for, two shares of its length, or None."""
+    """Return Overture's flags of tunnels: each with the part that it holds for, two shares of its length, or None."""
     rules, lists = _json(value), list | tuple | np.ndarray
     mappings = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
     return [
-        (_span(rule.get("between")), [*map(str, flags)])
+        (_span(rule.get("between")), [flag for flag in map(str, flags) if in_tunnel(objects([flag]))[0]])
         for rule in mappings
         if isinstance(flags := rule.get("values"), lists)
     ]
@@ -296,7 +296,7 @@ def _span(part: Any) -> tuple[float, float] | None:
 
 
 def _flags(value: Any) -> list[str]:
-    """Return Overture's flags that hold for a whole segment."""
+    """Return Overture's flags of tunnels that hold for a whole segment."""
     return [flag for part, flags in _rules(value) if part is None for flag in flags]
 
 
@@ -307,7 +307,7 @@ def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, Boo
 
     pieces: list[tuple[Any, int, bool]] = []
     for k, (shape, value) in enumerate(zip(shapes, values, strict=True)):
-        parts = [part for part, flags in _rules(value) if part is not None and in_tunnel(objects([";".join(flags)]))[0]]
+        parts = [part for part, flags in _rules(value) if part is not None and flags]
         if not parts or not isinstance(shape, shapely.LineString):
             pieces.append((shape, k, False))
             continue

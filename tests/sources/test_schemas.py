@@ -266,6 +266,23 @@ def test_a_part_of_a_segment_may_lack_an_end(tmp_path, container, between):
 
 
 @pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
+@pytest.mark.parametrize("between", [None, [0.0, 0.5]])
+def test_a_tunnel_may_be_a_link_too(tmp_path, container, between):
+    lines = [shapely.LineString([(k / 100, 0), (k / 100, 0.01)]) for k in range(2)]
+    rule = [{"values": ["is_link", "is_tunnel"], "between": between}]
+    columns = {"class": ["secondary"] * 2, "subtype": ["road"] * 2, "road_flags": [rule, None]}
+    source = tmp_path / f"a.{container}"
+    if container in ("frame", "parquet"):
+        table = gpd.GeoDataFrame(columns, geometry=lines, crs=4326)
+        table.to_parquet(tmp_path / "a.parquet")
+        source = table if container == "frame" else source
+    else:
+        write_vector(source, lines, **columns | {"road_flags": [json.dumps(rule), None]})
+    seen = 1.0 if between is None else 1.5
+    assert shapely.length(choose_roads(source).lines).sum() == pytest.approx(seen * 1105.7, rel=1e-2)
+
+
+@pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
 def test_a_part_of_a_segment_in_a_tunnel_is_cut_out(tmp_path, container):
     """Overture's `between`: shares of the length."""
     line = shapely.LineString([(0, 0), (0, 0.01)])
