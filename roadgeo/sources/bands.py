@@ -73,6 +73,8 @@ class Bands:
         Values are valid where they are not transparent.
     model_threshold : float or None
         Threshold of a map of probability that we wrote.
+    option : str
+        The option that chooses a band, before its number; "" of an array, of which one is given.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Bands:
     is_chosen: bool = False
     page: str = ""
     model_threshold: float | None = None
+    option: str = "--band "
 
     @property
     def n_unread(self) -> int:
@@ -93,7 +96,7 @@ class Bands:
     @property
     def options(self) -> str:
         """How a band is chosen, for people."""
-        return f"--band {listed(self.all_bands)}"
+        return f"{self.option}{listed(self.all_bands)}"
 
 
 @contextmanager
@@ -133,7 +136,7 @@ def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
     bands = tuple(labels[i] for i in chosen)
-    return Bands(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen)
+    return Bands(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen, option="")
 
 
 def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Bands:
