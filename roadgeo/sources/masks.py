@@ -43,8 +43,9 @@ _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are inte
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _MAX_ROAD_SHARE = 0.35  # of a frame
 #: Drawings in two colours, smooth or as JPEG: share of the variance along one line of colours, of pixels beyond either
-#: end, how far from an end of 0 to 255 a colour counts as pure, and most mixed pixels for each of the rarer end.
-_ON_A_LINE, _END, _PURE, _MOST_MIXED = 0.97, 0.002, 38, 1.5
+#: end, how far from an end of 0 to 255 a colour counts as pure, most mixed pixels for each of the rarer end, and least
+#: share of neighbours that are equal, as those of no photograph are.
+_ON_A_LINE, _END, _PURE, _MOST_MIXED, _FLAT = 0.97, 0.002, 38, 1.5, 0.5
 _MANY_VALUES = 9  # beside a fill that no file declares
 
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
@@ -315,7 +316,9 @@ def _of_two_colours(raster: Bands, observed: AnyArray) -> Bands:
 
     sampled = share(observed)
     dark, light = np.mean(sampled < _PURE), np.mean(sampled > 255 - _PURE)
-    if 1.0 - dark - light > _MOST_MIXED * min(dark, light):
+    rows, _ = _middle(raster)
+    flat = np.mean((rows[:, 1:] == rows[:, :-1]).all(axis=2))
+    if 1.0 - dark - light > _MOST_MIXED * min(dark, light) or flat < _FLAT:
         return raster
     return replace(_changed(raster, lambda values, valid: (share(values)[..., None], valid)), bands=raster.bands[:1])
 

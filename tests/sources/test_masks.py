@@ -136,6 +136,17 @@ def test_mixtures_of_two_colours_are_smooth_edges(
     assert np.mean(found == (shares[..., 0] > 0.5)) > 0.99
 
 
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_a_photograph_of_two_colours_is_no_drawing(tmp_path: Path, roads: np.ndarray, ending: str) -> None:
+    """No two pixels of a photograph are the same for long."""
+    large = np.kron(roads, np.ones((4, 4), bool))[..., None]
+    grain = np.random.default_rng(0).normal(0, 6, (*large.shape[:2], 1))
+    picture = np.clip(np.where(large, (200, 200, 190), (60, 90, 50)) + grain, 0, 255).astype(np.uint8)
+    PIL.Image.fromarray(picture).save(tmp_path / f"a{ending}", quality=90)
+    with pytest.raises(PhotographError):
+        read_mask(tmp_path / f"a{ending}")
+
+
 @pytest.mark.parametrize("library", ["file", "PIL"])
 @pytest.mark.parametrize("colour", [(255, 0, 0), (255, 255, 255), (0, 0, 0)])
 def test_smooth_edges_of_alpha_do_not_widen_roads(
