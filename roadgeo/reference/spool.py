@@ -15,7 +15,6 @@ from typing import TypeAlias
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
-from roadgeo.storage.vectors import load_pyogrio
 
 __all__ = ["Bounds", "Cell", "Spool"]
 
@@ -55,7 +54,7 @@ class Spool:
         OSError
             They cannot be written.
         """
-        pyogrio = load_pyogrio()
+        import pyogrio
         import shapely
 
         if not len(lines):
@@ -98,7 +97,7 @@ class Spool:
         self, wanted: Callable[[AnyArray], BoolArray | bool], box: Bounds | None = None
     ) -> tuple[AnyArray, AnyArray]:
         """Return the wanted lines of all parts that a box touches, and their labels."""
-        pyogrio = load_pyogrio()
+        import pyogrio
         import shapely
 
         lines, texts = [np.empty(0, object)], [np.empty((0, 2), object)]

@@ -30,7 +30,6 @@ __all__ = [
     "describe_layer",
     "first_line",
     "list_layers",
-    "load_pyogrio",
     "read_layer",
     "require_file",
 ]
@@ -71,17 +70,6 @@ class VectorLayer(NamedTuple):
     notes: dict[str, str]
 
 
-def load_pyogrio() -> Any:
-    """Return pyogrio, loaded without the drivers to leave out: it would print a line for each that its GDAL has not."""
-    given = os.environ.pop("GDAL_SKIP", None)
-    try:
-        import pyogrio
-    finally:
-        if given is not None:
-            os.environ["GDAL_SKIP"] = given
-    return pyogrio
-
-
 def list_layers(path: Path) -> list[tuple[str, str]]:
     """Return the names and geometry types of a file's layers.
 
@@ -90,7 +78,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
     RoadSourceError
         The file cannot be read, or not without opening others.
     """
-    pyogrio = load_pyogrio()
+    import pyogrio
 
     with _guarded(path) as file:
         return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(file)]
@@ -98,7 +86,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
 
 def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
     """Return the number of features that a layer claims to hold, and its columns' names; errors as of `list_layers`."""
-    pyogrio = load_pyogrio()
+    import pyogrio
 
     with _guarded(path, layer) as file:
         info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
@@ -113,7 +101,7 @@ def read_layer(
     The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
     names is read as Latin-1, which may garble it, and that is reported. It raises as `list_layers` does.
     """
-    pyogrio = load_pyogrio()
+    import pyogrio
 
     with _guarded(path) as file:
         layer = layer or str(pyogrio.list_layers(file)[0][0])
@@ -170,7 +158,7 @@ def _aside(path: Path) -> Iterator[Path]:
 
     Beside an XML file it writes what it found in it, beside a shapefile a new index where that is missing or damaged.
     """
-    pyogrio = load_pyogrio()
+    import pyogrio
 
     is_shapefile = path.suffix.lower() == ".shp" and path.is_file() and not _has_index(path)
     is_broken = _BREAK.search(str(path.absolute())) is not None
@@ -213,7 +201,7 @@ def _head(path: Path) -> bytes:
 @contextmanager
 def _few_drivers() -> Iterator[None]:
     """Have pyogrio's GDAL know only the drivers above, and those that the user allows."""
-    pyogrio = load_pyogrio()
+    import pyogrio
     from pyogrio import core
 
     with _LOCK:
@@ -226,14 +214,13 @@ def _few_drivers() -> Iterator[None]:
             yield
         finally:
             pyogrio.set_gdal_config_options({"GDAL_SKIP": None if given == os.environ.get("GDAL_SKIP") else given})
-            with warnings.catch_warnings(action="ignore"):  # on drivers that its GDAL has not
-                core._register_drivers()
+            core._register_drivers()
 
 
 @contextmanager
 def _offline() -> Iterator[None]:
     """Let no request of pyogrio's GDAL reach anything; a file's own datum shift stays."""
-    pyogrio = load_pyogrio()
+    import pyogrio
 
     # Blocks of a drawing within blocks have no end.
     options = {**NETWORK, **OWN_SHIFT, "GML_DOWNLOAD_SCHEMA": "NO", "DXF_INLINE_BLOCKS": "NO"}

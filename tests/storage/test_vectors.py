@@ -5,8 +5,6 @@ import gzip
 import json
 import os
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -16,7 +14,6 @@ import pyogrio
 import pytest
 import shapely
 from support.loopback import counting_server
-from worlds.fenway import write_vector
 
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.overpass import read_area
@@ -183,11 +180,3 @@ def test_a_pipe_or_a_broken_map_is_told_of_by_the_name_that_was_given(tmp_path: 
     with pytest.raises(RoadSourceError) as error:
         read_lines(tmp_path / "roads.gml")
     assert "/roadgeo-" not in str(error.value)
-
-
-def test_programs_that_leave_drivers_out_print_no_line_for_those_that_are_not_there(tmp_path: Path) -> None:
-    path = write_vector(tmp_path / "a.gpkg", [shapely.LineString([(0, 0), (0.01, 0.01)])])
-    run = [sys.executable, "-m", "roadgeo", "index", "--roads", str(path), "-o", str(tmp_path / "o.gpkg")]
-    done = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert "Warning" not in done.stderr
-    assert "intersections" in done.stderr
