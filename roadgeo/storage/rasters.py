@@ -252,7 +252,7 @@ def read_palette(dataset: DatasetReader, band: int = 1, channels: int = 3) -> An
 
 
 def value_bands(dataset: DatasetReader) -> list[int]:
-    """Return the numbers of the bands, without that of transparency."""
+    """Return the numbers of all bands but transparency."""
     return [i for i, color in zip(dataset.indexes, dataset.colorinterp, strict=True) if color.name != "alpha"]
 
 
