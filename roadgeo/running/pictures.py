@@ -99,7 +99,7 @@ def read_picture(picture: Any) -> str | AnyArray:
     if array.ndim not in (2, 3):
         raise MaskError(f"an array of shape {array.shape}; expected (rows, columns), with bands first or last")
     array = _bands_last(array)
-    # Of four bands of which the last is full, as matplotlib and OpenCV read pictures, that one is alpha.
+    # Where the last of four bands is full, as matplotlib and OpenCV read pictures, that one is alpha.
     full = 1.0 if array.dtype.kind == "f" else np.iinfo(array.dtype).max if array.dtype.kind in "iu" else None
     return array[..., :3] if array.ndim == 3 and array.shape[2] == 4 and (array[..., 3] == full).all() else array
 

@@ -122,7 +122,7 @@ def _best(image: _Image, references: Sequence[Reference]) -> Verified:
 def _inexact(place: Georeference, reference: Reference) -> float:
     """Return how exactly PROJ takes an image's CRS to a map's, metres; infinity where a datum has no name and no shift.
 
-    0 where it does not know otherwise: the shift is the file's own, or the ellipsoid that of all datums of today.
+    0 where it does not know otherwise: the shift is the file's own, or all datums of today share its ellipsoid.
     """
     stated_m = exactness(place.crs, reference.index.plane.crs, place.middle()).sigma_m
     own = known_crs(place.crs)

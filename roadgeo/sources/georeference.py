@@ -32,7 +32,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     Parameters
     ----------
     crs : str, optional
-        CRS of a world file, as pyproj takes it; it replaces the raster's own and that of files beside it.
+        CRS of a world file, as pyproj takes it; it replaces the raster's own, and the one in files beside it.
 
     Raises
     ------

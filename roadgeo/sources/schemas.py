@@ -288,7 +288,7 @@ def _rules(value: Any) -> list[tuple[tuple[float, float] | None, list[str]]]:
 
 
 def _span(part: Any) -> tuple[float, float] | None:
-    """Return two shares of a length, the lesser first; a missing one is that of an end. None: they are no pair."""
+    """Return two shares of a length, the lesser first; a missing one is the end of the line. None: they are no pair."""
     if not isinstance(part, list | tuple | np.ndarray) or len(part) != 2:
         return None
     ends = [float(end) if is_filled(end) else default for end, default in zip(part, (0.0, 1.0), strict=True)]
