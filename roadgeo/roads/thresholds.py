@@ -41,7 +41,7 @@ _MAX_DEPTH = 2.3  # ninth decile of the depth of light pixels, of its mean: 1.8 
 
 #: Neighbours in a faint map differ by one level, in a map of classes by any number of them.
 _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
-#: Shares of neighbours of one number in a mask of numbered roads: of all, and without those of the commonest number.
+#: Shares of neighbours of one number in a mask of numbered roads: of all, and without the commonest number.
 #: Smooth edges of a plain mask are a pixel wide: they have at most two neighbours in three of their value.
 _ALIKE, _OTHERS_ALIKE = 0.9, 0.8
 #: Share of neighbours that differ in a photograph, and their usual difference, of the span.

@@ -44,7 +44,7 @@ _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the mid
 _MAX_ROAD_SHARE = 0.35  # of a frame
 #: Drawings in two colours, smooth or as JPEG: share of the variance along one line of colours, of pixels beyond either
 #: end, how far from an end of 0 to 255 a colour counts as pure, most mixed pixels for each of the rarer end, and least
-#: share of neighbours that are equal, as those of no photograph are.
+#: share of neighbours that are equal, as in no photograph.
 _ON_A_LINE, _END, _PURE, _MOST_MIXED, _FLAT = 0.97, 0.002, 38, 1.5, 0.5
 _MANY_VALUES = 9  # beside a fill that no file declares
 
