@@ -1,4 +1,3 @@
-import re
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -253,14 +252,6 @@ REAL = {
     "boston/boston_osm_roads.gpkg": (14195, 14760, 13364),
     "boston/cambridge_city_centerlines.geojson": (1515, 1522, 1460),
 }
-
-
-def test_the_counts_of_the_documentation_are_these():
-    page = (Path(__file__).parents[2] / "docs" / "references.md").read_text(encoding="utf-8")
-    counted = {Path(name).name: " | ".join(f"{count:,}" for count in counts) for name, counts in REAL.items()}
-    listed = re.findall(r"^\| (\S+\.\S+) \| (\S+ \| \S+ \| \S+) \|", page, re.MULTILINE)
-    assert len(listed) >= 4
-    assert [(name, counts) for name, counts in listed if counted[name] != counts] == []
 
 
 #: The smallest source of each format, of those that are counted in seconds.
