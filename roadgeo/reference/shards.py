@@ -55,6 +55,7 @@ SCHEMA = "roadgeo.shards/1"
 ENDING = ".shards"
 
 _MANIFEST = "manifest.json"
+_MAX_MANIFEST = 256 << 20
 
 #: Names that a folder or a shard may have: none leads elsewhere.
 _NAME = re.compile(r"[\w-]{1,80}")
@@ -179,6 +180,8 @@ def read_manifest(path: Path) -> Manifest:
     """
     again = "build it again with `roadgeo index --shards`"
     try:
+        if path.stat().st_size > _MAX_MANIFEST:
+            raise IndexFormatError(f"{path}: is too large to be a manifest of shards; {again}")
         return _parse_manifest(json.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise IndexFormatError(f"{path}: {(error.strerror or str(error)).lower()}; {again}") from error
