@@ -220,9 +220,8 @@ def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[f
     if len(times) < len(paths) or len({*times}) == 1:
         times = _named_times(paths)
         if not times:
-            _LOG.warning(
-                "images are taken to be 1 s apart: not all of them have times of EXIF; --interval says otherwise"
-            )
+            said = "not all of them have times, in EXIF or in their names"
+            _LOG.warning("images are taken to be 1 s apart: %s; --interval says otherwise", said)
             return paths, []
         _LOG.warning("frames have the times that stand in their names; --interval says otherwise")
     order = sorted(range(len(paths)), key=times.__getitem__)

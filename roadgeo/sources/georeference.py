@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["read_georeference", "read_pixel_shape", "read_stated_middle"]
 
 _STEPS_ASIDE = 4  # orientations beyond this make rows of columns
+_WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
 _HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
 
@@ -104,7 +105,7 @@ def _crs_beside(path: Path) -> str | None:
     """Read the CRS in the `.prj` beside a picture, or in its `.aux.xml`."""
     for suffix in (".prj", ".PRJ"):
         beside = path.with_suffix(suffix)
-        if beside.is_file():
+        if beside.is_file() and beside.stat().st_size <= _PRJ_BYTES:
             try:
                 return name_crs(beside.read_text("utf-8", "replace").strip())
             except CrsError as error:
@@ -141,7 +142,7 @@ def _of_world_file(path: Path) -> FloatArray | None:
     short = f".{suffix[1:2]}{suffix[-1:]}w" if len(suffix) > 2 else ".wld"
     for candidate in (short, f"{suffix}w", ".wld", short.upper()):
         beside = path.with_suffix(candidate)
-        if not beside.is_file():
+        if not beside.is_file() or beside.stat().st_size > _WORLD_FILE_BYTES:
             continue
         try:
             a, d, b, e, c, f = (float(word.replace(",", ".")) for word in beside.read_text("ascii").split()[:6])

@@ -80,6 +80,7 @@ _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine, .np
 
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
+_MAX_SIDECAR = 1 << 20
 _MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
@@ -267,7 +268,9 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
 def read_sidecar(path: str | os.PathLike[str], name: str) -> str:
     """Return the text of an element in the `.aux.xml` beside a raster; "" without one. No more is taken of it."""
     beside = Path(os.fspath(path) + ".aux.xml")
-    text = beside.read_text("utf-8", "replace") if beside.is_file() else ""
+    if not beside.is_file() or beside.stat().st_size > _MAX_SIDECAR:
+        return ""
+    text = beside.read_text("utf-8", "replace")
     match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", text)
     return html.unescape(match[1]).strip() if match else ""
 

@@ -570,3 +570,10 @@ def test_pictures_that_are_cut_off_say_so_in_plain_words(tmp_path: Path, name: s
     message = r"damaged or cut short; copy or export it again$"
     with pytest.raises(MaskError, match=message), open_raster(path) as raster:
         raster.read()
+
+
+def test_a_file_beside_a_raster_that_is_too_large_to_be_one_is_not_read(tmp_path: Path) -> None:
+    stated = b"<NoDataValue>7</NoDataValue>"
+    for blanks, nodata in ((1000, 7.0), (2_000_000, None)):
+        (tmp_path / "a.png.aux.xml").write_bytes(stated + b" " * blanks)
+        assert sidecar_nodata(tmp_path / "a.png") == nodata

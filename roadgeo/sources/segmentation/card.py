@@ -24,6 +24,7 @@ _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"n
 #: Free input sizes are made multiples of this, as encoders with five reductions ask for.
 TILE_STEP = 32
 _DEFAULT_TILE, _MAX_TILE, _MOST_LISTED = 512, 4096, 100
+_MAX_SIDECAR = 4 << 20
 
 #: Numbers that a model may take, and those that it may give as probabilities or logits; whole ones may be classes.
 _TAKEN = ("float32", "float16", "float64", "uint8")
@@ -234,7 +235,7 @@ def _classes(names: Any) -> dict[int, str]:
 
 def _read_sidecar(path: Path) -> dict[str, Any]:
     """Read the STAC item beside a model, if there is one and it describes a model."""
-    if not path.is_file():
+    if not path.is_file() or path.stat().st_size > _MAX_SIDECAR:
         return {}
     document = json.loads(path.read_text(encoding="utf-8"))
     properties = document.get("properties", {}) if isinstance(document, dict) else {}
