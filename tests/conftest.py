@@ -36,7 +36,7 @@ settings.load_profile("steady")
 SECONDS = Path(__file__).with_name("seconds.json")
 SLOW_S = 2.0
 
-#: Left to the night, with all that needs one of the fixtures below: how the names of these tests begin.
+#: Left to the night, with all that is slow or needs one of the fixtures below: how the names of these tests begin.
 NIGHTLY = (
     "tests/cli/test_fence.py",
     "tests/cli/test_traces.py",
@@ -50,7 +50,15 @@ NIGHTLY = (
     "tests/serving/test_workers.py::test_neither_processes",
     "tests/test_endurance.py",
 )
-DAILY = ("tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/tutorial.md]",)
+#: Never left, however slow: what a user meets first, and what writers that are killed leave behind.
+DAILY = (
+    "tests/accept/",
+    "tests/cli/",
+    "tests/docs/test_docs.py::test_a_page_does_what_it_says[README.md]",
+    "tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/tutorial.md]",
+    "tests/reference/test_files.py",
+    "tests/test_corpus.py",
+)
 #: A browser, QGIS and the development data.
 NIGHTLY_FIXTURES = {"browser", "chromium", "data_dir", "qgis"}
 
@@ -89,12 +97,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_report_header() -> str:
-    return f"nightly (-m ''): {', '.join((*NIGHTLY, *sorted(NIGHTLY_FIXTURES)))}"
+    return f"nightly (-m ''): slow ones but {', '.join(DAILY)}; {', '.join((*NIGHTLY, *sorted(NIGHTLY_FIXTURES)))}"
 
 
-def is_nightly(item: pytest.Item) -> bool:
+def is_nightly(item: pytest.Item, is_slow: bool) -> bool:
+    """Whether a test is left out: of two beginnings that fit its name the longer one decides."""
+    daily, nightly = (max(len(start) * item.nodeid.startswith(start) for start in names) for names in (DAILY, NIGHTLY))
     needs = NIGHTLY_FIXTURES.intersection(getattr(item, "fixturenames", ()))
-    return bool(needs) or (item.nodeid.startswith(NIGHTLY) and item.nodeid not in DAILY)
+    return bool(needs) or nightly > daily or (is_slow and not daily)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -104,9 +114,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     seconds = json.loads(SECONDS.read_text("utf-8"))
     for item in items:
-        if item.nodeid in seconds:
+        if is_slow := item.nodeid in seconds:
             item.add_marker(pytest.mark.slow)
-        if is_nightly(item):
+        if is_nightly(item, is_slow):
             item.add_marker(pytest.mark.nightly)
     if hasattr(config, "workerinput"):
         files = Counter()

@@ -169,7 +169,7 @@ _OWN_M, _OWN_COS = 150.0, 0.95
 _LEAST_POINTS = 15
 #: Number of the best proposals that are judged anew, number of road points that judge them, and their greatest
 #: distance, metres. A coarse map multiplies all lengths.
-_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 400, 160, 260.0
+_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 200, 160, 260.0
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
 _TRIAL = VoteRates(0.55, 1.5)
@@ -355,7 +355,7 @@ _MAX_ANCHORS = 30
 #: In a lattice every crossing fits in four turns.
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
 #: Number of an anchor's proposals that grow, and number of grown places that are compared with the map.
-_MAX_GROWN, _MAX_KEPT = 80, 2
+_MAX_GROWN, _MAX_KEPT = 32, 2
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
