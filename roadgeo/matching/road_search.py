@@ -169,7 +169,7 @@ _OWN_M, _OWN_COS = 150.0, 0.95
 _LEAST_POINTS = 15
 #: Number of the best proposals that are judged anew, number of road points that judge them, and their greatest
 #: distance, metres. A coarse map multiplies all lengths.
-_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 200, 160, 260.0
+_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 400, 160, 260.0
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
 _TRIAL = VoteRates(0.55, 1.5)
