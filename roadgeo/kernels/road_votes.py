@@ -304,7 +304,7 @@ def improve_votes(
     raster: Raster,
     trial: VoteRates,
 ) -> None:
-    """Vary the turn and scale of each proposal in small steps, with more points, and score it anew.
+    """Vary the turn, then the scale of each proposal in small steps, with more points, and score it anew.
 
     Parameters
     ----------
@@ -324,11 +324,12 @@ def improve_votes(
         gain = math.log(trial.hit_rate / rate)
         loss = math.log((1.0 - trial.hit_rate) / (1.0 - rate))
         votes[k, 3] = -np.inf
-        for a in range(turns.shape[0]):
-            for b in range(factors.shape[0]):
-                turn, scale = turn0 + turns[a], scale0 * factors[b]
-                c, d = math.cos(turn) * scale / raster.cell, math.sin(turn) * scale / raster.cell
-                met = _count_met(points, first, last, places.cells[j, 0], places.cells[j, 1], turn, c, d, raster)
-                ratio = gain * met + loss * (last - first - met)
-                if ratio > votes[k, 3]:
-                    votes[k, 1], votes[k, 2], votes[k, 3] = turn, scale, ratio
+        for step in range(turns.shape[0] + factors.shape[0]):
+            n = step - turns.shape[0]
+            turn = turn0 + turns[step] if n < 0 else votes[k, 1]
+            scale = scale0 if n < 0 else scale0 * factors[n]
+            c, d = math.cos(turn) * scale / raster.cell, math.sin(turn) * scale / raster.cell
+            met = _count_met(points, first, last, places.cells[j, 0], places.cells[j, 1], turn, c, d, raster)
+            ratio = gain * met + loss * (last - first - met)
+            if ratio > votes[k, 3]:
+                votes[k, 1], votes[k, 2], votes[k, 3] = turn, scale, ratio

@@ -157,7 +157,7 @@ def _draw(index: ReferenceIndex) -> RoadRaster:
 _LEAST_DENSITY = 0.005
 _PER_RADIAN = WHOLE_TURN / (2.0 * math.pi)
 _TURN_STEPS = np.radians([-6.0, -3.0, 0.0, 3.0, 6.0])
-_SCALE_STEPS = np.array([0.96, 1.0, 1.04])
+_SCALE_STEPS = np.array([0.96, 1.04])
 
 
 #: How far branches that agree may be apart.

@@ -152,11 +152,12 @@ class TestVote:
         for was, now in zip(before, votes, strict=True):
             x, y = places.cells[int(was[0])]
             s = int(np.argmin(np.abs(np.log(points.scales / was[2]))))
-            ratios = {}
-            for turn in was[1] + turns:
-                for scale in was[2] * factors:
-                    met = naive.hits(points, s, x, y, turn, scale, raster)
-                    rate = TRIAL.chance * places.density[int(was[0])]
-                    ratios[turn, scale] = naive.ratio(met, TRIAL.hit_rate, rate)
-            assert now[3] == pytest.approx(max(ratios.values()))
-            assert ratios[now[1], now[2]] == pytest.approx(now[3])
+
+            def ratio(turn, scale, s=s, x=x, y=y, density=places.density[int(was[0])]):
+                met = naive.hits(points, s, x, y, turn, scale, raster)
+                return naive.ratio(met, TRIAL.hit_rate, TRIAL.chance * density)
+
+            turn = max(was[1] + turns, key=lambda turn: ratio(turn, was[2]))
+            scale = max([was[2], *(was[2] * factors)], key=lambda scale: ratio(turn, scale))
+            assert (now[1], now[2]) == (turn, scale)
+            assert now[3] == pytest.approx(ratio(turn, scale))
