@@ -355,7 +355,7 @@ _MAX_ANCHORS = 30
 #: In a lattice every crossing fits in four turns.
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
 #: Number of an anchor's proposals that grow, and number of grown places that are compared with the map.
-_MAX_GROWN, _MAX_KEPT = 32, 2
+_MAX_GROWN, _MAX_KEPT = 80, 2
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
