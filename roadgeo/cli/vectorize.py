@@ -91,4 +91,5 @@ def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, reading: 
         out_dir, task.stem, look.mask, graph, scene.intersections, coarser=look.coarser, photo=photo
     )
     counts = f"{counted(len(scene.intersections), 'intersection')}, {counted(graph.n_edges, 'road')} between them"
+    counts += f"; read {look.part}" if look.part else ""
     return f"{counts}; wrote {', '.join(map(str, files + kept))}"

@@ -37,7 +37,7 @@ from roadgeo.sources.exif import read_time
 from roadgeo.sources.georeference import read_pixel_shape
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.files import writing
-from roadgeo.storage.rasters import is_raster
+from roadgeo.storage.rasters import count_frames, is_raster, pages_of
 
 __all__ = ["FrameOptions", "follow_frames", "read_frames", "read_stills"]
 
@@ -195,15 +195,18 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
             begun_s = yield from _video(path, options, stack, begun_s)
         else:
             aspect = options.aspect or read_pixel_shape(path)[0] or 1.0
-            yield _FrameFile(path, Path(path).name, times[n] if times else begun_s, aspect)
-            begun_s += options.interval_s or 1.0
+            pages, step_s, begun_s = pages_of(path), options.interval_s or 1.0, times[n] if times else begun_s
+            for k, page in enumerate(pages, 1):
+                name = Path(path).name if len(pages) == 1 else f"{Path(path).stem}_page{k}"
+                yield _FrameFile(page, name, begun_s, aspect)
+                begun_s += step_s
 
 
 def _is_video(path: str) -> bool:
-    """Whether a file is a video: by its name, or because it is no picture and OpenCV plays it."""
+    """Whether a file is a video: by its name, or because it is no still picture and OpenCV plays it."""
     suffix = Path(path).suffix.lower()
     if suffix in SUFFIXES or not Path(path).is_file():
-        return False
+        return count_frames(path) > 1
     with Path(path).open("rb") as file:
         is_text = b"\0" not in file.read(_HEAD_BYTES)  # a list of other files to play, maybe
     return suffix in VIDEOS or (not (is_text or is_raster(path)) and cv2.VideoCapture(path, cv2.CAP_FFMPEG).isOpened())

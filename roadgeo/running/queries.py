@@ -161,12 +161,15 @@ class QueryRoads:
         Pixels of the query for each of the mask, along a side: above 1 for a large photograph, below for a coarse one.
     probability : ProbabilityMap or None
         What a segmenter sees in a photograph, in its own pixels, or in its mask's where it is large.
+    part : str
+        What is read of a file that holds more, for people.
     """
 
     mask: RoadMask
     coarser: float = 1.0
     probability: ProbabilityMap | None = None
     of_photograph: bool = False
+    part: str = ""
 
 
 def read_roads(
@@ -187,7 +190,7 @@ def read_roads(
     """
     with open_query(path, reading) as query:
         if query.mask is not None:
-            return QueryRoads(query.mask.read(query.mask.thresholds[0]))
+            return QueryRoads(query.mask.read(query.mask.thresholds[0]), part=query.mask.part)
     with as_file(path) as file:
         plugin = plugin_of(reading)
         if plugin:
@@ -198,7 +201,8 @@ def read_roads(
                 roads = segmented.roads(Pass()).mask
             except MaskError:  # the roads seen are worth a look all the same
                 roads = RoadMask(np.zeros(segmented.grid, np.bool_), name=file)
-            return QueryRoads(roads, segmented.coarser, probability.resized(segmented.own), of_photograph=True)
+            probability, part = probability.resized(segmented.own), segmented.photograph.page
+            return QueryRoads(roads, segmented.coarser, probability, of_photograph=True, part=part)
 
 
 def _is_chosen_by_values(reading: ReadOptions) -> bool:

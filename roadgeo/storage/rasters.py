@@ -42,10 +42,12 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_SIDE",
     "RAW",
+    "count_frames",
     "is_raster",
     "name_page",
     "open_raster",
     "page_of",
+    "pages_of",
     "raster_size",
     "read_palette",
     "read_sidecar",
@@ -94,6 +96,7 @@ _CANON = b"CR"  # at byte 8
 _PAGE = re.compile(r"GTIFF_DIR:(\d+):(.+)", re.DOTALL)  # GDAL's name of a page
 _BREAKS_OFF = re.compile(r"IReadBlock failed|Premature end|DGifSlurp|Failed to read directory at")  # GDAL's words
 _STILL = re.compile(rb"(?s)....ftyp(?:hei|hev|mif1|msf1|avi)")  # HEIC and AVIF
+_FRAMES = re.compile(rb"(?s)\x89PNG(?:(?!IDAT).)*acTL(....)")  # their number, in an animated PNG
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
@@ -253,7 +256,9 @@ def read_palette(dataset: DatasetReader, band: int = 1, channels: int = 3) -> An
 
 
 def value_bands(dataset: DatasetReader) -> list[int]:
-    """Return the numbers of all bands but transparency."""
+    """Return the numbers of all bands but transparency; of a GIF, where each is a picture, the first."""
+    if dataset.driver == "GIF":
+        return [1]
     return [i for i, color in zip(dataset.indexes, dataset.colorinterp, strict=True) if color.name != "alpha"]
 
 
@@ -308,6 +313,8 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"{name}: a raw photograph ({path.suffix.lower()}), of which only a thumbnail could be read; develop it: "
             "save it as JPEG or TIFF"
         )
+    if driver == "WEBP" and head[12:16] == b"VP8X" and head[20] & 2:
+        raise MaskError(f"{name}: an animated WebP, which is not read; save its pictures, or an animated GIF or PNG")
     if driver is None and not more:
         if Path(name).suffix.lower() in _IMAGES and head and not re.search(rb"[^\t\n\f\r -\x7e\x80-\xff]", head):
             raise MaskError(
@@ -346,12 +353,32 @@ def name_page(path: str, page: int | None) -> str:
     return path if page is None or _PAGE.fullmatch(path) else f"GTIFF_DIR:{page}:{Path(path).absolute()}"
 
 
-def page_of(dataset: DatasetReader) -> str:
-    """Return the page of a TIFF that is read, for people: "page 1 of 2"; "" where it has one."""
-    page, pages = _PAGE.fullmatch(dataset.name), [name for name in dataset.subdatasets if name.startswith("GTIFF_DIR:")]
-    if page:
-        return f"page {page[1]}"
-    return f"page 1 of {len(pages)}" if len(pages) > 1 else ""
+def pages_of(path: str | os.PathLike[str]) -> list[str]:
+    """Return the names by which the pages of a TIFF are opened, but for reduced ones; none of a file without pages."""
+    with open_raster(path, upright=False) as dataset:
+        return [name for name in dataset.subdatasets if _PAGE.fullmatch(name)] or [dataset.name]
+
+
+def count_frames(path: str | os.PathLike[str]) -> int:
+    """Return of how many pictures an animation consists, GIF or PNG; 1 of other files."""
+    if is_named_remote(path) or not os.path.isfile(path):
+        return 1
+    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+        head = file.read(_HEAD_BYTES)
+    if head.startswith(b"GIF8"):
+        with open_raster(path) as dataset:
+            return int(dataset.count)
+    stated = _FRAMES.match(head)
+    return int.from_bytes(stated[1], "big") if stated else 1
+
+
+def page_of(path: str | os.PathLike[str]) -> str:
+    """Return which picture of a file with several is read, for people: "page 1 of 2"; "" where it has one."""
+    pages, frames = pages_of(path), count_frames(path)
+    page = _PAGE.fullmatch(pages[0])
+    if frames > 1:
+        return f"picture 1 of {frames}"
+    return f"page {page[1]}" + f" of {len(pages)}" * (len(pages) > 1) if page else ""
 
 
 def _require_boxes(path: Path, name: str) -> None:

@@ -318,6 +318,18 @@ def test_a_video_is_known_by_its_content_too(tmp_path: Path) -> None:
         list(read_frames([str(tmp_path / "list.PIO")]))
 
 
+@pytest.mark.parametrize("suffix", ["tif", "gif", "png"])
+def test_pages_and_animations_are_frames(tmp_path: Path, suffix: str) -> None:
+    shown = [streets(), streets()[::-1].copy(), streets()[:, ::-1].copy()]
+    first, *others = map(PIL.Image.fromarray, shown)
+    first.save(tmp_path / f"a.{suffix}", save_all=True, append_images=others, duration=1000)
+    read = list(read_frames([str(tmp_path / f"a.{suffix}")]))
+    names = [f"a_page{k + 1}" if suffix == "tif" else f"a_{k:06d}" for k in range(3)]
+    assert [(frame.name, frame.time_s) for frame in read] == [(name, float(k)) for k, name in enumerate(names)]
+    for frame, picture in zip(read, shown, strict=True):
+        np.testing.assert_array_equal(frame.mask.roads, picture > 127)
+
+
 def test_names_in_the_order_of_text_are_mentioned(masks: list[str], caplog: pytest.LogCaptureFixture) -> None:
     renamed = [str(Path(masks[0]).with_name(name)) for name in ("n1.png", "n10.png", "n2.png")]
     for path, name in zip(masks, renamed, strict=False):

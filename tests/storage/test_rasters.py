@@ -27,6 +27,7 @@ from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.photograph import open_photograph
+from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.storage.gdal import CONSENT, skip_drivers
 from roadgeo.storage.rasters import (
     is_raster,
@@ -466,10 +467,15 @@ def test_a_pyramid_is_no_raw_photograph(tmp_path: Path) -> None:
         read_mask(path)
 
 
-def two_pages(path: Path) -> tuple[Path, np.ndarray]:
+def crossing() -> np.ndarray:
     roads = np.zeros((80, 100), np.uint8)
     cv2.line(roads, (0, 20), (100, 30), 255, 5)
     cv2.line(roads, (40, 0), (30, 80), 255, 5)
+    return roads
+
+
+def two_pages(path: Path) -> tuple[Path, np.ndarray]:
+    roads = crossing()
     pages = [PIL.Image.fromarray(image) for image in (roads[::-1].copy(), roads)]
     pages[0].save(path, save_all=True, append_images=pages[1:])
     return path, roads
@@ -488,8 +494,39 @@ def test_pages_of_a_tiff(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), roads)
     with pytest.raises(MaskError, match="holds no pages"):
         read_mask(name_page(str(tmp_path / "a.png"), 2))
-    with open_raster(tmp_path / "a.png") as dataset:
-        assert page_of(dataset) == ""
+    assert page_of(tmp_path / "a.png") == ""
+
+
+@pytest.mark.parametrize("kind", ["mask", "photograph"])
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [("a.tif", "page 1 of 3"), ("turned.tif", "page 1 of 3"), ("a.gif", "picture 1 of 3"), ("a.png", "picture 1 of 3")],
+)
+def test_the_first_of_several_pictures_is_read_and_named(tmp_path: Path, name: str, part: str, kind: str) -> None:
+    save_several(tmp_path / name, roads := crossing())
+    if kind == "mask":
+        with open_mask(tmp_path / name) as opened:
+            assert opened.part == part
+            np.testing.assert_array_equal(opened.read(opened.thresholds[0]).roads, roads > 0)
+        return
+    with open_photograph(tmp_path / name) as photograph:
+        assert photograph.page == part
+        np.testing.assert_array_equal(photograph.read(0, 0, 100, 80, (80, 100))[0][..., 1] > 127, roads > 0)
+
+
+def test_an_animated_webp_is_refused(tmp_path: Path) -> None:
+    save_several(tmp_path / "a.webp", crossing())
+    with pytest.raises(MaskError, match="an animated WebP, which is not read; save its pictures"):
+        read_mask(tmp_path / "a.webp")
+
+
+def save_several(path: Path, image: np.ndarray) -> None:
+    """Write an image, and two others that are like it upside down and turned around."""
+    exif = PIL.Image.Exif()
+    if path.stem == "turned":
+        exif[274], image = 3, image[::-1, ::-1]
+    pages = [PIL.Image.fromarray(one) for one in (image, image[::-1].copy(), image[:, ::-1].copy())]
+    pages[0].save(path, save_all=True, append_images=pages[1:], exif=exif)
 
 
 def save_pages(path: Path, kinds: tuple[int, ...], sizes: tuple[int, ...], order: str, tag: int) -> Path:

@@ -111,7 +111,7 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
             values, valid = _read(dataset, chosen, (left, top, width, height), shape)
             return tones.rgb(values) ^ np.uint8(turn), valid & box.covers((left, top, width, height), shape)
 
-        yield Photograph(name, dataset.width, dataset.height, read, page_of(dataset))
+        yield Photograph(name, dataset.width, dataset.height, read, page_of(path))
 
 
 class _Box(NamedTuple):
