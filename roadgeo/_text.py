@@ -1,12 +1,13 @@
-"""Text that came from strangers (names of files, of references, in files), made fit to be shown."""
+"""Text that came from strangers (names of files, of references, in files), made fit to be shown; times in it."""
 
 from __future__ import annotations
 
 import html
 import re
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
-__all__ = ["counted", "in_html", "listed", "visible"]
+__all__ = ["counted", "in_html", "listed", "read_moment", "visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -41,3 +42,12 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 def _escape(match: re.Match[str]) -> str:
     return match[0].encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+def read_moment(text: str) -> datetime:
+    """Read a time; UTC unless it has another zone."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ValueError(f"got {text!r}, expected a time such as 2024-05-01T09:30:00Z") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

@@ -11,7 +11,8 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack
 
-from roadgeo.errors import MaskError, name_package
+from roadgeo._text import read_moment
+from roadgeo.errors import MaskError, RoadSourceError, name_package
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -20,7 +21,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
 from roadgeo.reference.reference import BuildOptions, Reference
 from roadgeo.reference.shards import ShardedReference
-from roadgeo.roads.kinds import RoadKind
+from roadgeo.roads.kinds import ROAD_KINDS, RoadKind
 from roadgeo.running.answers import Answer
 
 if TYPE_CHECKING:
@@ -122,13 +123,19 @@ def fence(read: Files = (), write: Files = (), *, network: bool = False) -> bool
 
 
 def _paths(given: Files) -> tuple[str, ...]:
-    one = (given,) if isinstance(given, str | os.PathLike) else given
     try:
-        return tuple(os.fspath(path) for path in one)
+        return tuple(map(os.fsdecode, (given,) if isinstance(given, str | bytes | os.PathLike) else given))
     except TypeError as error:
-        raise TypeError(
+        raise MaskError(
             f"{type(given).__name__} is no path, nor several; expected files, folders or patterns"
         ) from error
+
+
+def _path(given: str | os.PathLike[str]) -> str:
+    try:
+        return os.fsdecode(given)
+    except TypeError as error:
+        raise MaskError(f"{type(given).__name__} is no path; expected a file's") from error
 
 
 def index(
@@ -183,7 +190,9 @@ def index(
         from roadgeo.sources.roads import choose_roads, fetch_roads
         from roadgeo.workflows import build_reference
 
-        where = None if path is None else Path(path)
+        where = None if path is None else Path(_path(path))
+        if kinds not in ROAD_KINDS:
+            raise RoadSourceError(f"kinds={kinds!r}: expected one of {', '.join(ROAD_KINDS)}")
         is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(road, int | float) for road in roads)
         name = name or (where.stem if where else _name_of(roads, is_box))
         if is_box or _is_place(roads):
@@ -345,7 +354,7 @@ def verify(
 
     usual = CheckOptions()
     options = replace(usual, tolerance_m=tolerance, search=replace(usual.search, reach_m=reach, turn_deg=max_turn))
-    return verify_image(os.fspath(image), _open(reference), VerifyRun(options=options, crs=crs))
+    return verify_image(_path(image), _open(reference), VerifyRun(options=options, crs=crs))
 
 
 @_hinted(FlightHints)
@@ -357,7 +366,7 @@ def track(
     unordered: bool = False,
     every: float = 1.0,
     interval: float | None = None,
-    start: datetime | None = None,
+    start: datetime | str | None = None,
     focal: float | None = None,
     **hints: Unpack[FlightHints],
 ) -> list[Row]:
@@ -380,7 +389,7 @@ def track(
     every, interval : float
         Seconds between the frames that are taken of a video, and between images: by default as EXIF or their names
         state it, where all of them have times, else 1.
-    start : datetime
+    start : datetime or str
         When the first frame was taken.
     focal : float
         Focal length, pixels: the places of the camera are given too.
@@ -395,7 +404,7 @@ def track(
     Raises
     ------
     MaskError
-        A frame cannot be read, or there are no frames.
+        A frame cannot be read, or there are no frames, or they are no files.
     IndexFormatError
         A reference is missing or unusable.
     """
@@ -405,14 +414,14 @@ def track(
     from roadgeo.flights.tracker import TrackOptions, latest
 
     options = TrackOptions(locate=_with_hints(LocateOptions(), {"time_limit": 10.0, **hints}, None))
-    moved = None if motion is None else read_motion(os.fspath(motion))
+    moved = None if motion is None else read_motion(_path(motion))
     reading = FrameOptions(gsd_m=_hint("gsd", hints.get("gsd")), motion=moved, every_s=every, interval_s=interval)
-    paths = _paths(frames)
+    paths, begun = _paths(frames), read_moment(start) if isinstance(start, str) else start
     opened: Any = _open(reference)
     tracked = latest(follow_frames(paths, reading, opened, options, unordered))
     if not tracked:
         raise MaskError(f"no frames in {', '.join(paths)}")
-    return make_rows(tracked, start, _hint("focal", focal))
+    return make_rows(tracked, begun, _hint("focal", focal))
 
 
 def vectorize(image: Picture, *, gsd: float | tuple[float, float] | str | None = None) -> nx.MultiGraph:
@@ -462,9 +471,9 @@ def _hint(name: str, value: Any) -> Any:
 
 def _open(reference: References) -> list[AnyReference]:
     """Open what is not open yet; nothing named: all of the library."""
-    from roadgeo.reference.opening import open_references
+    from roadgeo.reference.opening import open_reference, open_references
 
-    given = [reference] if isinstance(reference, Reference | ShardedReference | str | os.PathLike) else list(reference)
-    if not given:
-        return open_references(())
-    return [open_references([os.fspath(item)])[0] if isinstance(item, str | os.PathLike) else item for item in given]
+    opened = Reference | ShardedReference
+    one = isinstance(reference, opened | str | bytes | os.PathLike) or not isinstance(reference, Iterable)
+    given: Any = [reference] if one else reference
+    return [item if isinstance(item, opened) else open_reference(item) for item in given] or open_references(())

@@ -236,8 +236,53 @@ def test_what_is_no_picture_is_none_for_a_type_checker() -> None:
 
 @pytest.mark.parametrize("frames", [3.14, None, ["a.png", 3], [np.zeros((40, 40))]])
 def test_a_flight_is_of_files(porto, frames):
-    with pytest.raises(TypeError, match=r"is no path, nor several; expected files, folders or patterns"):
+    with pytest.raises(MaskError, match=r"is no path, nor several; expected files, folders or patterns"):
         roadgeo.track(frames, porto)
+
+
+#: What takes each kind of argument, and what is answered to one of another type.
+TAKES = {
+    "locate": (lambda given, _: roadgeo.locate(given), "is no picture; expected a path"),
+    "vectorize": (lambda given, _: roadgeo.vectorize(given), "is no picture; expected a path"),
+    "verify": (lambda given, _: roadgeo.verify(given), "is no path; expected a file's"),
+    "fence": (lambda given, _: roadgeo.fence(given), "is no path, nor several"),
+    "index": (lambda given, _: roadgeo.index(given), "cannot be read: .*expected a path"),
+    "path": (lambda given, _: roadgeo.index(ROADS, path=given or 0), "is no path; expected a file's"),
+    "kinds": (lambda given, _: roadgeo.index(ROADS, kinds=given), "expected one of main, drivable"),
+    "motion": (lambda given, porto: roadgeo.track("a.png", porto, motion=given or 0), "is no path; expected a file's"),
+    "open": (lambda given, _: roadgeo.open_reference(given), "is no reference; expected a path, a name"),
+    "locate on": (lambda given, _: roadgeo.locate(DRONE, given), "is no reference; expected a path, a name"),
+    "verify on": (lambda given, _: roadgeo.verify(DRONE, [given]), "is no reference; expected a path, a name"),
+    "track on": (lambda given, _: roadgeo.track("a.png", given), "is no reference; expected a path, a name"),
+}
+
+
+@pytest.mark.parametrize("given", [3.14, None, True, object()], ids=["float", "None", "bool", "object"])
+@pytest.mark.parametrize("taker", TAKES)
+def test_what_is_of_another_type_is_answered_in_one_line(porto, taker, given):
+    call, answer = TAKES[taker]
+    with pytest.raises(roadgeo.RoadgeoError, match=answer):
+        call(given, porto)
+
+
+@pytest.mark.parametrize("given", ["", "."])
+def test_a_reference_has_a_name(given):
+    with pytest.raises(roadgeo.RoadgeoError, match="names no reference; expected a path such as"):
+        roadgeo.open_reference(given)
+
+
+@pytest.mark.parametrize("place", ["first", 3.14, None, (1.0, 2.0, 3.0)])
+def test_a_place_is_a_number_or_a_point(answer, place):
+    with pytest.raises(NotLocatedError, match="is no place; expected its number, from 1, or longitude and latitude"):
+        answer.take(place)
+    assert answer.take(np.int64(1)).center == answer.center
+
+
+def test_the_start_of_a_flight_may_be_text(porto, tmp_path):
+    Image.open(DRONE).save(tmp_path / "a.png")
+    (row,) = roadgeo.track(tmp_path / "a.png", porto, start="2024-05-01T09:30:00+01:00")
+    assert row.time is not None
+    assert row.time.isoformat() == "2024-05-01T08:30:00+00:00"
 
 
 def test_frames_have_their_own_times_unless_told(porto, tmp_path):

@@ -8,13 +8,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from roadgeo._options import RESULTS, option, part, take
+from roadgeo._text import read_moment
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.options import Known, Shared, Verbosity, argument, command, make_options, open_maps, threaded
@@ -77,15 +78,6 @@ pymavlink.
 """
 
 
-def _read_time(text: str) -> datetime:
-    """Read a time; UTC unless it has another zone."""
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise ValueError(f"got {text!r}, expected a time such as 2024-05-01T09:30:00Z") from error
-    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-
-
 # fmt: off
 @dataclass(frozen=True, kw_only=True)
 class Track:
@@ -112,7 +104,7 @@ class Track:
         limits=(0, None), above=True, rare=True)
     aspect: float | None = take(ReadOptions, "aspect", group=FLIGHT,
         help="How many times a pixel is as wide as high. Default: as the file states it, else 1.")
-    start: datetime | None = option("--start", "TIME", FLIGHT, "When the first frame was taken.", read=_read_time)
+    start: datetime | None = option("--start", "TIME", FLIGHT, "When the first frame was taken.", read=read_moment)
     reading: ReadOptions = part(ReadOptions, *(name for name in SEGMENTING if name != "segmenter"))
     segmenter: str = take(ReadOptions, "segmenter", form="MODEL.onnx", help="Who finds the roads.",
         plugins="", type=click.Path())

@@ -79,7 +79,15 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     IndexFormatError
         When there is neither.
     """
-    name = os.fspath(name_or_path)
+    try:
+        name = os.fsdecode(name_or_path)
+    except TypeError as error:
+        what = type(name_or_path).__name__
+        raise IndexFormatError(
+            f"{what} is no reference; expected a path, a name, or a reference that is open"
+        ) from error
+    if not Path(name).name:
+        raise IndexFormatError(f"{name!r} names no reference; expected a path such as porto.gpkg, or a name")
     if is_remote(name):
         return fetch_manifest(name)
     for paths in (reference_paths(name), _shelved(name)):

@@ -46,7 +46,7 @@ def take_place(location: Location, taken: Taken, options: LocateOptions | None =
     places = location.places
     if not places:
         raise NotLocatedError(f"{location.query}: no place is listed that could be taken ({location.reason})")
-    number = taken if isinstance(taken, int) else _nearest(location, taken)
+    number = taken if isinstance(taken, int | np.integer) else _nearest(location, taken)
     if not 1 <= number <= len(places):
         listed = "1 is listed" if len(places) == 1 else f"{len(places)} are listed"
         raise NotLocatedError(f"{location.query}: there is no place {number}: {listed} ({location.reason})")
@@ -168,8 +168,10 @@ def _nearest(location: Location, lonlat: tuple[float, float]) -> int:
     Raises
     ------
     NotLocatedError
-        None lies within a frame's width.
+        None lies within a frame's width, or it is no point.
     """
+    if np.shape(lonlat) != (2,):
+        raise NotLocatedError(f"{lonlat!r} is no place; expected its number, from 1, or longitude and latitude")
     away = [metres_apart(np.array(place.center[2:]), np.array(lonlat)) for place in location.places]
     nearest = int(np.argmin(away))
     place = location.places[nearest]

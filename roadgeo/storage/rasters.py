@@ -361,7 +361,7 @@ def pages_of(path: str | os.PathLike[str]) -> list[str]:
 
 def count_frames(path: str | os.PathLike[str]) -> int:
     """Return of how many pictures an animation consists, GIF or PNG; 1 of other files."""
-    if is_named_remote(path) or not os.path.isfile(path):
+    if is_named_remote(path) or not Path(path).is_file():
         return 1
     with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
         head = file.read(_HEAD_BYTES)

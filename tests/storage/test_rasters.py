@@ -27,7 +27,6 @@ from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.photograph import open_photograph
-from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.storage.gdal import CONSENT, skip_drivers
 from roadgeo.storage.rasters import (
     is_raster,

@@ -21,8 +21,8 @@ import pyproj
 import shapely
 from starlette.exceptions import HTTPException
 
+from roadgeo._text import read_moment
 from roadgeo.cli.options import Read
-from roadgeo.cli.track import _read_time
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
@@ -215,7 +215,7 @@ _HINTS = {
     b"R": Read("range", hints.read_range).convert,
     b"C": Read("focal", hints.HINTS["focal"].read).convert,
     b"G": Read("gsd", hints.read_gsd).convert,
-    b"M": Read("time", _read_time).convert,
+    b"M": Read("time", read_moment).convert,
     b"T": lambda text, *_: read_truths(text, explain=True),
 }
 
