@@ -204,9 +204,9 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
 
 def _is_video(path: str) -> bool:
     """Whether a file is a video: by its name, or because it is no still picture and OpenCV plays it."""
-    suffix = Path(path).suffix.lower()
-    if suffix in SUFFIXES or not Path(path).is_file():
-        return count_frames(path) > 1
+    suffix, is_file = Path(path).suffix.lower(), Path(path).is_file()
+    if suffix in SUFFIXES or not is_file:
+        return is_file and count_frames(path) > 1
     with Path(path).open("rb") as file:
         is_text = b"\0" not in file.read(_HEAD_BYTES)  # a list of other files to play, maybe
     return suffix in VIDEOS or (not (is_text or is_raster(path)) and cv2.VideoCapture(path, cv2.CAP_FFMPEG).isOpened())

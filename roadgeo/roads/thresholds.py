@@ -44,6 +44,11 @@ _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
 #: Shares of neighbours of one number in a mask of numbered roads: of all, and without the commonest number.
 #: Smooth edges of a plain mask are a pixel wide: they have at most two neighbours in three of their value.
 _ALIKE, _OTHERS_ALIKE = 0.9, 0.8
+#: The same saved as JPEG, of any quality: roads are clearly lighter than the ground, and than what JPEG leaves around
+#: them. Of the greatest value nearby (pixels), few have half: at most this share of those that have most of it, which is
+#: 0.25 in such masks and 0.39 in soft maps. And of the lightest roads many have less than most: 0.4 in such masks, else 0.
+_CLEAR, _RINGING, _NEARBY_PX, _HALF, _MOST, _FEW, _MANY = 48, 20, 7, 0.3, 0.7, 0.3, 0.25
+_GREY = 6  # bands of a grey picture differ by this at most, rounded by JPEG or WebP
 #: Share of neighbours that differ in a photograph, and their usual difference, of the span.
 _RESTLESS, _SMOOTH = 0.3, 0.15
 _MANY_LEVELS = 8  # more classes than this do not look like roads
@@ -168,12 +173,32 @@ def find_numbered(sample: Sample) -> float | None:
     Its ground is the least value, of none above 0, or the greatest.
     """
     levels = sample.levels
-    if len(levels) < 3 or are_labels(levels) or np.ptp(sample.observed, axis=1).any():
+    if len(levels) < 3 or are_labels(levels) or np.ptp(sample.observed, axis=1).max() > _GREY:
         return None
     rows, (low, high) = sample.read_rows(), (levels[:2], levels[-2:])
     pairs = ((low[0], low), (high[1], high))[int(low[0] > 0) :]
     grounds = ((rows != ground, float(np.mean(pair))) for ground, pair in pairs)
-    return next((middle for shown, middle in grounds if are_patches(rows, shown) and are_roads(shown)), None)
+    return next(
+        (middle for shown, middle in grounds if are_patches(rows, shown) and are_roads(shown)), _find_blurred(rows)
+    )
+
+
+def _find_blurred(rows: AnyArray) -> float | None:
+    """Return the threshold of numbers of roads in (rows, columns) that JPEG has blurred; else None."""
+    if rows.dtype != np.uint8:
+        return None
+    is_dark = np.median(rows) < 128
+    above = rows if is_dark else ~rows
+    nearby = cv2.dilate(above, np.ones((_NEARBY_PX, _NEARBY_PX), np.uint8))
+    values = above[nearby > _CLEAR]
+    shares = values / nearby[nearby > _CLEAR]
+    roads = values[shares >= _MOST]
+    if len(roads) == 0 or np.median(above) > 0 or not are_roads(cv2.medianBlur(above, 3) > _RINGING):
+        return None
+    are_steep = np.count_nonzero((shares > _HALF) & (shares < _MOST)) < _FEW * len(roads)
+    if not are_steep or np.mean(roads < _MOST * np.quantile(roads, 0.95)) < _MANY:
+        return None
+    return float(_RINGING if is_dark else 255 - _RINGING)
 
 
 def are_patches(values: AnyArray, shown: BoolArray) -> bool:

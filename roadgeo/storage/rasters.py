@@ -145,8 +145,8 @@ def open_raster(
             _require_chunks(Path(path), name)
         if page and drivers != ["GTiff"]:
             raise MaskError(f"{name}: holds no pages; only TIFFs do: leave --page out")
-        if drivers == ["GTiff"] and not page and (number := _first_whole_page(Path(path))) > 1:
-            page = _PAGE.fullmatch(name_page(os.fspath(path), number))
+        if not page and drivers == ["GTiff"]:
+            page = _PAGE.fullmatch(pages_of(path)[0].removeprefix("GTIFF_DIR:1:"))
     if drivers == ["NumPy"]:
         with warnings.catch_warnings(), _opened_array(path, name) as dataset:
             yield dataset
@@ -340,12 +340,14 @@ def _is_raw(path: Path, head: bytes) -> bool:
     return False
 
 
-def _first_whole_page(path: Path) -> int:
-    """Return the first page of a TIFF, counted from 1, that is neither a reduced picture nor a mask; else 1."""
+def _whole_pages(path: Path) -> list[int]:
+    """Return the pages of a TIFF, counted from 1, that are neither reduced pictures nor masks; none of another file."""
     with path.open("rb") as file, contextlib.suppress(struct.error):
-        kinds = zip(*(tiff_pages(file, tag) for tag in (_SUBFILE_TYPE, _OLD_SUBFILE_TYPE)), strict=False)
-        return next((number for number, (kind, old) in enumerate(kinds, 1) if not (kind & _IN_PART or old == 2)), 1)
-    return 1
+        if _driver_of(file.read(_HEAD_BYTES)) != "GTiff":
+            return []
+        kinds = list(zip(*(tiff_pages(file, tag) for tag in (_SUBFILE_TYPE, _OLD_SUBFILE_TYPE)), strict=False))
+        return [number for number, (kind, old) in enumerate(kinds, 1) if not (kind & _IN_PART or old == 2)]
+    return []
 
 
 def name_page(path: str, page: int | None) -> str:
@@ -354,14 +356,18 @@ def name_page(path: str, page: int | None) -> str:
 
 
 def pages_of(path: str | os.PathLike[str]) -> list[str]:
-    """Return the names by which the pages of a TIFF are opened, but for reduced ones; none of a file without pages."""
-    with open_raster(path, upright=False) as dataset:
-        return [name for name in dataset.subdatasets if _PAGE.fullmatch(name)] or [dataset.name]
+    """Return the names by which the pages of a TIFF are opened, but for reduced pictures and masks; else the path."""
+    name = os.fspath(path)
+    if is_named_remote(path):
+        with open_raster(path, upright=False) as dataset:
+            return [page for page in dataset.subdatasets if _PAGE.fullmatch(page)] or [name]
+    numbers = [] if _PAGE.fullmatch(name) else _whole_pages(Path(path))
+    return [name] if numbers in ([], [1]) else [name_page(name, number) for number in numbers]
 
 
 def count_frames(path: str | os.PathLike[str]) -> int:
     """Return of how many pictures an animation consists, GIF or PNG; 1 of other files."""
-    if is_named_remote(path) or not Path(path).is_file():
+    if is_named_remote(path) or _PAGE.fullmatch(os.fspath(path)):
         return 1
     with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
         head = file.read(_HEAD_BYTES)
@@ -374,11 +380,11 @@ def count_frames(path: str | os.PathLike[str]) -> int:
 
 def page_of(path: str | os.PathLike[str]) -> str:
     """Return which picture of a file with several is read, for people: "page 1 of 2"; "" where it has one."""
-    pages, frames = pages_of(path), count_frames(path)
-    page = _PAGE.fullmatch(pages[0])
-    if frames > 1:
-        return f"picture 1 of {frames}"
-    return f"page {page[1]}" + f" of {len(pages)}" * (len(pages) > 1) if page else ""
+    pages, frames = [_PAGE.fullmatch(name) for name in pages_of(path)], count_frames(path)
+    first, last = pages[0], pages[-1]
+    if first and last:
+        return f"page {first[1]}" + f" of {last[1]}" * (first != last)
+    return f"picture 1 of {frames}" if frames > 1 else ""
 
 
 def _require_boxes(path: Path, name: str) -> None:

@@ -567,7 +567,7 @@ def test_a_thumbnail_in_front_is_no_picture(
     with open_raster(path) as dataset, open_photograph(path) as photograph:
         assert dataset.shape == (photograph.height, photograph.width) == size
         assert dataset.read(1)[0, 0] == page - 1
-        assert (f"page {page}" in page_of(dataset)) == (f"page {page}" in photograph.page) == (page > 1)
+        assert (f"page {page}" in page_of(path)) == (f"page {page}" in photograph.page) == (page > 1)
     if sizes[0] >= 64:
         with open_raster(name_page(str(path), 1)) as dataset:  # which one may ask for
             assert dataset.shape == (sizes[0],) * 2
