@@ -48,7 +48,7 @@ _DATA = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="ut
 _WORDS = {maker: _by_word(kinds) for maker, kinds in _DATA["words"].items()}
 _CODES = {column: _by_word(kinds) for column, kinds in _DATA["codes"].items()}
 _SURE, _GENERAL, _NAMES, _TAGS, _OTHERS = (_DATA["columns"][of] for of in ("kind", "general", "name", "tags", "other"))
-_TUNNELS = _DATA["tunnels"]
+_TUNNELS, _UNBUILT, _FLAGS = _DATA["tunnels"], _DATA["unbuilt"], "road_flags"
 _KINDS = [*_SURE, *_GENERAL]
 _OSM_NAME, _OVERTURE = "OpenStreetMap", "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0"
 _OSM = _WORDS[_OSM_NAME] | _by_word({word: [word] for word in KNOWN_HIGHWAYS} | {_NONE: sorted(NO_ROADS)})
@@ -63,7 +63,7 @@ _CERTAIN = {
 }
 _FEWEST = 2  # such words for roads, of those in a column of a general or unknown name, until all are believed
 _AREA = "area"
-_KNOWN = {name[:10] for name in (*_KINDS, *_TUNNELS, *_NAMES, *_OSM_MARKS, _AREA)}
+_KNOWN = {name[:10] for name in (*_KINDS, *_TUNNELS, *_UNBUILT, *_NAMES, *_OSM_MARKS, _AREA)}
 _PAIR = re.compile(r'"(highway|tunnel|area)"\s*(?:=>|:)\s*"([^"]*)"')
 _CODE = re.compile(r"[a-z]\d+")
 #: Number of values by which the content of a column is recognised.
@@ -109,10 +109,12 @@ class Schema:
         kinds, others = self._kinds(columns, len(table.shapes))
         if whole and self.is_guess:
             kinds, others = np.where(others, "", kinds), np.zeros_like(others)
-        shapes = table.shapes[~others]
-        parted, of, in_part = shapes, np.arange(len(shapes)), np.zeros(len(shapes), bool)
-        if "road_flags" in columns:
-            parted, of, in_part = _parted(shapes, columns["road_flags"][~others])
+        for name in _UNBUILT.keys() & columns.keys():
+            others |= _each(columns[name], partial(_begins, _UNBUILT[name])).astype(bool)
+        parted = shapes = table.shapes[~others]
+        of, flags = np.arange(len(shapes)), np.full(len(shapes), "", object)
+        if _FLAGS in columns:
+            parted, of, flags = _parted(shapes, columns[_FLAGS][~others])
         lines, place = simple_lines(parted)
         areas = simple_areas(shapes)
         row = np.flatnonzero(~others)[of[place]]
@@ -120,7 +122,7 @@ class Schema:
         hidden += [_tag(columns[name], "tunnel") for name in _TAGS if name in columns]
         tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
         called = next((columns[name] for name in _NAMES if name in columns), None)
-        counts = {"no_roads": int(others.sum()), "broken": _count_broken(shapes)}
+        counts = {"no_roads": len(others) - len(np.unique(of)), "broken": _count_broken(shapes)}
         by = " and ".join(name for name, _ in self.kinds)
         stated = {"attribution": self.attribution, "kind_columns": by if self.is_guess else "", **table.meta, **counts}
         return RoadLines(
@@ -128,7 +130,7 @@ class Schema:
             crs_name(table.crs),
             kinds[row],
             np.full(len(row), "", object) if called is None else _each(called[row], _text),
-            np.logical_or.reduce([in_part[place], *tunnels]),
+            np.logical_or.reduce([in_tunnel(flags[place]), *tunnels]),
             bool(self.kinds),
             {"features": len(table.shapes)} | {key: value for key, value in stated.items() if value},
             areas,
@@ -276,50 +278,44 @@ def _tag(values: AnyArray, key: str) -> AnyArray:
     return _each(values, find)
 
 
-def _rules(value: Any) -> list[tuple[tuple[float, float] | None, list[str]]]:
-    """Return Overture's flags of tunnels: each with the part that it holds for, two shares of its length, or None."""
+def _rules(value: Any) -> list[tuple[tuple[float, float], list[str]]]:
+    """Return Overture's flags of tunnels and of roads that are not there, with the part of the length that has them."""
     rules, lists = _json(value), list | tuple | np.ndarray
     mappings = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
     return [
-        (_span(rule.get("between")), [flag for flag in map(str, flags) if in_tunnel(objects([flag]))[0]])
+        (
+            _span(rule.get("between")),
+            [flag for flag in map(str, flags) if in_tunnel(objects([flag]))[0] or _is_unbuilt(flag)],
+        )
         for rule in mappings
         if isinstance(flags := rule.get("values"), lists)
     ]
 
 
-def _span(part: Any) -> tuple[float, float] | None:
-    """Return two shares of a length, the lesser first; a missing one is the end of the line. None: they are no pair."""
+def _span(part: Any) -> tuple[float, float]:
+    """Return two shares of a length, the lesser first; a missing one is the end of the line, as both are of no pair."""
     if not isinstance(part, list | tuple | np.ndarray) or len(part) != 2:
-        return None
+        return 0.0, 1.0
     ends = [float(end) if is_filled(end) else default for end, default in zip(part, (0.0, 1.0), strict=True)]
     return min(max(min(ends), 0.0), 1.0), min(max(*ends, 0.0), 1.0)
 
 
-def _flags(value: Any) -> list[str]:
-    """Return Overture's flags of tunnels that hold for a whole segment."""
-    return [flag for part, flags in _rules(value) if part is None for flag in flags]
-
-
-def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, BoolArray]:
-    """Cut segments where Overture has a part of them in a tunnel; return pieces, whose each is, and if it is hidden."""
+def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, AnyArray]:
+    """Cut segments where Overture's flags hold for a part; return the pieces that are there, whose, and their flags."""
     import shapely
     from shapely.ops import substring
 
-    pieces: list[tuple[Any, int, bool]] = []
+    pieces: list[tuple[Any, int, str]] = []
     for k, (shape, value) in enumerate(zip(shapes, values, strict=True)):
-        parts = [part for part, flags in _rules(value) if part is not None and flags]
-        if not parts or not isinstance(shape, shapely.LineString):
-            pieces.append((shape, k, False))
-            continue
-        ends = sorted({0.0, 1.0, *(end for part in parts for end in part)})
-        for low, high in pairwise(ends):
-            hidden = any(part[0] <= (low + high) / 2 <= part[1] for part in parts)
-            pieces.append((substring(shape, low, high, normalized=True), k, hidden))
-    return (
-        objects(piece for piece, _, _ in pieces),
-        np.array([k for _, k, _ in pieces], np.intp),
-        np.array([hidden for _, _, hidden in pieces], np.bool_),
-    )
+        rules = _rules(value)
+        ends = sorted({0.0, 1.0, *(end for part, flags in rules if flags for end in part)})
+        for low, high in pairwise(ends if isinstance(shape, shapely.LineString) else (0.0, 1.0)):
+            flags = ";".join(flag for (start, end), held in rules if start <= (low + high) / 2 <= end for flag in held)
+            if not _is_unbuilt(flags):
+                whole = high - low == 1.0
+                pieces.append((shape if whole else substring(shape, low, high, normalized=True), k, flags))
+    parted, of, held = zip(*pieces, strict=True) if pieces else ((), (), ())
+    return objects(parted), np.array(of, np.intp), objects(held)
 
 
 def _text(value: Any) -> str:
@@ -338,10 +334,16 @@ def _json(value: Any) -> Any:
 
 def _tunnel_of(name: str, value: Any) -> Any:
     """Return OpenStreetMap's words for what a column of this name tells of a tunnel."""
-    if name == "road_flags":
-        return _flags(value)
     begins = _TUNNELS[name]
-    return value if not begins else "yes" if re.match(begins, str(value).strip(), re.IGNORECASE) else "no"
+    return value if not begins else "yes" if _begins(begins, value) else "no"
+
+
+def _begins(pattern: str, value: Any) -> bool:
+    return re.match(pattern, str(value).strip(), re.IGNORECASE) is not None
+
+
+def _is_unbuilt(flags: str) -> bool:
+    return any(_begins(_UNBUILT[_FLAGS], flag) for flag in flags.split(";"))
 
 
 def _count_broken(shapes: AnyArray) -> int:

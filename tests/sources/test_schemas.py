@@ -7,6 +7,7 @@ import logging
 import geopandas as gpd
 import networkx as nx
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from worlds.fenway import write_vector
@@ -280,6 +281,62 @@ def test_a_tunnel_may_be_a_link_too(tmp_path, container, between):
         write_vector(source, lines, **columns | {"road_flags": [json.dumps(rule), None]})
     seen = 1.0 if between is None else 1.5
     assert shapely.length(choose_roads(source).lines).sum() == pytest.approx(seen * 1105.7, rel=1e-2)
+
+
+#: Columns with the state of a road: its value where it is not built, and where it is.
+UNBUILT = {
+    "road_flags": ([{"values": ["is_link", "is_under_construction"], "between": None}], [{"values": ["is_link"]}]),
+    "ETAT": ("En construction", "En service"),
+    "etat_de_l_objet": ("En projet", "En service"),
+    "operationalState": ("Under Construction", "Open"),
+    "ZUS": ("4000", "1000"),
+    "Zustand": ("Im Bau", "in Betrieb"),
+    "STATUS": ("Proposed", "Active"),
+}
+
+
+@pytest.mark.parametrize("kinds", ["drivable", "all"])
+@pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg", "shp", "csv"])
+@pytest.mark.parametrize("column", UNBUILT)
+def test_a_road_that_is_not_built_is_none(tmp_path, caplog, column, container, kinds):
+    lines = [shapely.LineString([(k / 100, 0), (k / 100, 0.01)]) for k in range(3)]
+    unbuilt, built = UNBUILT[column]
+    values = [unbuilt, built, None]
+    columns = {"class": ["secondary"] * 3, "subtype": ["road"] * 3}
+    source = tmp_path / f"a.{container}"
+    table = gpd.GeoDataFrame({**columns, column: values}, geometry=lines, crs=4326)
+    if container == "parquet":
+        table.to_parquet(source)
+    elif container == "csv":
+        texts = [value and value if isinstance(value, str) else json.dumps(value) for value in values]
+        pd.DataFrame({**columns, column: texts, "geometry": shapely.to_wkt(lines)}).to_csv(source, index=False)
+    elif container != "frame":
+        texts = [value if isinstance(value, str | None) else json.dumps(value) for value in values]
+        write_vector(source, lines, **columns, **{column[:10]: texts})
+    found = choose_roads(
+        table if container == "frame" else source, kinds, crs="EPSG:4326" if container == "csv" else None
+    )
+    assert len(found.lines) == 2
+    assert "left out 1 of 3 features, which are no roads: streams, railways, fences, or not built" in caplog.text
+
+
+@pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
+@pytest.mark.parametrize("tunnels", [False, True])
+def test_a_part_of_a_segment_that_is_not_built_is_cut_out(tmp_path, container, tunnels):
+    line = shapely.LineString([(0, 0), (0, 0.01)])
+    rule = [
+        {"values": ["is_under_construction"], "between": [0.2, 0.5]},
+        {"values": ["is_bridge"], "between": [0.7, 1]},
+    ]
+    columns = {"class": ["secondary"], "subtype": ["road"], "road_flags": [rule]}
+    source = tmp_path / f"a.{container}"
+    if container in ("frame", "parquet"):
+        table = gpd.GeoDataFrame(columns, geometry=[line], crs=4326)
+        table.to_parquet(tmp_path / "a.parquet")
+        source = table if container == "frame" else source
+    else:
+        write_vector(source, [line], **columns | {"road_flags": [json.dumps(rule)]})
+    assert shapely.length(choose_roads(source, tunnels=tunnels).lines).sum() == pytest.approx(0.7 * 1105.7, rel=1e-2)
 
 
 @pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
