@@ -26,7 +26,25 @@ _LOG = logging.getLogger(__name__)
 #: Suffixes of the files that a folder is searched for, as `storage.rasters` reads them.
 SUFFIXES = (
     *(".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".jfif", ".jp2", ".j2k", ".webp", ".png", ".bmp", ".gif"),
-    *(".pgm", ".ppm", ".pnm", ".vrt", ".img", ".npy", ".j2c", ".jpc", ".jpf", ".jpx", ".dib", ".btf", ".tf8", ".gtiff"),
+    *(
+        ".pbm",
+        ".pgm",
+        ".ppm",
+        ".pnm",
+        ".pam",
+        ".pfm",
+        ".vrt",
+        ".img",
+        ".npy",
+        ".j2c",
+        ".jpc",
+        ".jpf",
+        ".jpx",
+        ".dib",
+        ".btf",
+        ".tf8",
+        ".gtiff",
+    ),
 )
 #: Suffixes of videos as cameras, phones and links write them, of which `track` takes frames.
 VIDEOS = (
@@ -52,7 +70,7 @@ VIDEOS = (
 )
 #: Files that lie beside pictures, and that nobody expects to be pictures: world files, side files, indexes, text.
 _BESIDE = re.compile(
-    r"\.(\w{1,4}w|wld|prj|qpj|xml|xmp|ovr|msk|aux|rrd|qml|qgs|qgz|index|txt|md|csv|tsv|json|html?|log|ya?ml|toml|srt)"
+    r"\.(\w{1,4}wx?|wldx?|prj|qpj|xml|xmp|ovr|msk|aux|rrd|qml|qgs|qgz|index|txt|md|csv|tsv|json|html?|log|ya?ml|toml|srt)"
 )
 
 #: File systems take names of 255 bytes; outputs, and their temporary names, need the rest.

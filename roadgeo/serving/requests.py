@@ -21,8 +21,7 @@ _MAGIC = {
     b"MM\0+": ".tif",
     b"\xff\xd8\xff": ".jpg",
     b"BM": ".bmp",
-    b"P5": ".pgm",
-    b"P4": ".pgm",
+    **dict.fromkeys((b"P4", b"P5", b"P6", b"P7"), ".pnm"),
     b"\0\0\0\x0cjP  ": ".jp2",
 }
 

@@ -137,10 +137,11 @@ def _of_files_beside(path: Path) -> tuple[str, FloatArray | None]:
 
 
 def _of_world_file(path: Path) -> FloatArray | None:
-    """Read the six numbers beside a picture: `.tfw`, `.pgw`, `.tifw`, `.wld` ..."""
+    """Read the six numbers beside a picture: `.tfw`, `.pgw`, `.tifw`, `.wld`, `.tfwx`, `.TFW` ..."""
     suffix = path.suffix.lower()
     short = f".{suffix[1:2]}{suffix[-1:]}w" if len(suffix) > 2 else ".wld"
-    for candidate in (short, f"{suffix}w", ".wld", short.upper()):
+    names = [name + more for name in (short, f"{suffix}w", ".wld") for more in ("", "x")]
+    for candidate in (*names, *map(str.upper, names)):
         beside = path.with_suffix(candidate)
         if not beside.is_file() or beside.stat().st_size > _WORLD_FILE_BYTES:
             continue

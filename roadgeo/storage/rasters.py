@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray
@@ -64,9 +65,10 @@ MAX_SIDE = 60_000
 #: An axis of an array no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
 
-#: First bytes of the formats that are read, and GDAL's names of their drivers, where it has one.
+#: First bytes of the formats that are read, and GDAL's names of their drivers, where it has one; others become arrays.
 _DRIVERS = (
     (rb"\x93NUMPY", "NumPy"),
+    (rb"P[1-47]\s|P[Ff]\s", "OpenCV"),
     (rb"II[*+]\0|MM\0[*+]", "GTiff"),
     (rb"\x89PNG\r\n\x1a\n", "PNG"),
     (rb"\xff\xd8\xff", "JPEG"),
@@ -135,7 +137,7 @@ def open_raster(
     page = _PAGE.fullmatch(os.fspath(path)) if isinstance(path, str) else None
     path = page[2] if page else path
     if remote:
-        drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[1:-1]]
+        drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[2:-1]]
     else:
         require_file(path, name)
         drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
@@ -147,7 +149,7 @@ def open_raster(
             raise MaskError(f"{name}: holds no pages; only TIFFs do: leave --page out")
         if not page and drivers == ["GTiff"]:
             page = _PAGE.fullmatch(pages_of(path)[0].removeprefix("GTIFF_DIR:1:"))
-    if drivers == ["NumPy"]:
+    if drivers[0] in ("NumPy", "OpenCV"):
         with warnings.catch_warnings(), _opened_array(path, name) as dataset:
             yield dataset
         return
@@ -315,6 +317,8 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
         )
     if driver == "WEBP" and head[12:16] == b"VP8X" and head[20] & 2:
         raise MaskError(f"{name}: an animated WebP, which is not read; save its pictures, or an animated GIF or PNG")
+    if driver is None and not more and Path(name).suffix.lower() == ".npz":
+        raise MaskError(f"{name}: an archive of arrays; save the one that is the mask with numpy.save")
     if driver is None and not more:
         if Path(name).suffix.lower() in _IMAGES and head and not re.search(rb"[^\t\n\f\r -\x7e\x80-\xff]", head):
             raise MaskError(
@@ -447,15 +451,17 @@ def _opened(path: str, drivers: list[str], may_fetch: bool) -> Iterator[DatasetR
 
 @contextmanager
 def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetReader]:
-    """Copy an array that NumPy saved into memory as a raster: (H, W), or with bands first or last."""
+    """Copy an array into memory as a raster: (H, W), or with bands first or last."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
     try:
-        array = _bands_first(np.lib.format.open_memmap(path, mode="r"))  # unpickles nothing
+        array = _bands_first(_read_array(path))
     except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers, by numpy.save") from error
+        raise MaskError(
+            f"{name}: no array that can be read ({reason}); expected numbers, by numpy.save, or PNM"
+        ) from error
     if array is None or array.dtype.kind not in "biuf":
         what = "" if array is None else f" of {array.dtype}"
         raise MaskError(f"{name}: holds an array{what}; expected (rows, columns) of real numbers, bands first or last")
@@ -470,6 +476,19 @@ def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetRe
             raster.write(np.asarray(array[band], kind), band + 1)
         raster.transform = rasterio.Affine.identity()
         yield raster
+
+
+def _read_array(path: str | os.PathLike[str]) -> AnyArray:
+    """Read the array of a file of NumPy's, or what GDAL does not read of the family of PNM."""
+    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+        if file.read(1) != b"P":
+            return np.lib.format.open_memmap(path, mode="r")  # unpickles nothing
+        file.seek(0)
+        stored = np.frombuffer(file.read() + b"\n", np.uint8)  # OpenCV has the last number end
+    array = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
+    if array is None:
+        raise ValueError("damaged or cut short")
+    return array if array.ndim == 2 else array[..., ::-1]  # which has blue first
 
 
 def _bands_first(array: AnyArray) -> AnyArray | None:

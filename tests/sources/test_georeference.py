@@ -84,6 +84,27 @@ def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
         read_georeference(path, "EPSG:32619")
 
 
+@pytest.mark.parametrize(
+    ("picture", "beside"),
+    [
+        *(
+            ("scan.png", f"scan.{name}")
+            for name in ("pgw", "pgwx", "pngw", "pngwx", "wld", "PGW", "PNGW", "PGWX", "WLD")
+        ),
+        *(("scan.jpg", f"scan.{name}") for name in ("jgw", "jgwx", "jpgw", "JGW", "JPGWX")),
+        *(("scan.TIF", f"scan.{name}") for name in ("tfw", "tfwx", "tifw", "TFW", "TFWX", "TIFW")),
+        *(("scan.jpeg", f"scan.{name}") for name in ("jgw", "jgwx", "jpegw", "JPEGW")),
+        *(("scan.webp", f"scan.{name}") for name in ("wpw", "webpw")),
+    ],
+)
+def test_world_files_have_many_names(tmp_path: Path, picture: str, beside: str) -> None:
+    cv2.imwrite(str(tmp_path / picture), BLACK)
+    (tmp_path / beside).write_text(WORLD_FILE)
+    found = read_georeference(tmp_path / picture, "EPSG:32619")
+    assert found is not None
+    assert found.matrix == pytest.approx(np.array(PLACE).reshape(3, 3), abs=1e-9)
+
+
 @pytest.mark.parametrize("version", ["WKT1_ESRI", "WKT2_2019"])
 def test_a_prj_beside_a_world_file_names_its_crs(tmp_path: Path, version: str) -> None:
     path = tmp_path / "scan.png"

@@ -367,6 +367,39 @@ def test_an_array_is_a_raster(tmp_path: Path, dtype: str, bands: str) -> None:
         assert raster.transform.is_identity
 
 
+def pnm(kind: str, roads: np.ndarray) -> bytes:
+    """Write a mask in a format of the family of PNM, in which PBM has black for 1."""
+    height, width = roads.shape
+    levels, size = 255 * roads.astype(np.uint8), f"\n# by hand\n{width} {height}\n".encode()
+    pam = f"P7\nWIDTH {width}\nHEIGHT {height}\nDEPTH 1\nMAXVAL 255\nTUPLTYPE GRAYSCALE\nENDHDR\n".encode()
+    return {
+        "P1": b"P1" + size + " ".join(map(str, 1 - roads.ravel())).encode(),
+        "P2": b"P2" + size + b"255\n" + " ".join(map(str, levels.ravel())).encode(),
+        "P3": b"P3" + size + b"255\n" + " ".join(f"{v} {v} {v}" for v in levels.ravel()).encode(),
+        "P4": b"P4" + size + np.packbits(1 - roads, axis=1).tobytes(),
+        "P5": b"P5" + size + b"255\n" + levels.tobytes(),
+        "P6": b"P6" + size + b"255\n" + np.repeat(levels, 3).tobytes(),
+        "P7": pam + levels.tobytes(),
+        "Pf": f"Pf\n{width} {height}\n-1.0\n".encode() + roads[::-1].astype("<f4").tobytes(),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["P1", "P2", "P3", "P4", "P5", "P6", "P7", "Pf"])
+def test_all_of_pnm_are_read(tmp_path: Path, kind: str) -> None:
+    roads = (crossing() > 0).astype(np.uint8)
+    (tmp_path / "a.pnm").write_bytes(pnm(kind, roads))
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.pnm").roads, roads > 0)
+    (tmp_path / "a.pnm").write_bytes(pnm(kind, roads)[: 2000 if kind != "P4" else 500])
+    with pytest.raises(MaskError, match="damaged or cut short"):
+        read_mask(tmp_path / "a.pnm")
+
+
+def test_an_archive_of_arrays_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", crossing())
+    with pytest.raises(MaskError, match=r"an archive of arrays; save the one that is the mask with numpy\.save"):
+        read_mask(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
