@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from roadgeo.kernels.arrays import Bytes2, Int32s1, Singles2
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin", "touches_solid"]
+__all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "shallow_first", "thin", "touches_solid"]
 
 GROUND = 0  # observed, no road
 ROAD = 1
@@ -87,8 +87,15 @@ def _is_ridge(
     return True
 
 
+def shallow_first(states: NDArray[np.uint8], distance: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return the flat indices of all ROAD pixels in the order of `distance` (see `thin`), in eighths of a pixel."""
+    pixels = np.flatnonzero(states == ROAD).astype(np.int32)
+    level = (np.minimum(distance.ravel()[pixels], DEEPEST) * LEVELS_PER_PIXEL).astype(np.uint16)
+    return pixels[np.argsort(level, kind="stable")]
+
+
 @kernel(writes=("states",))
-def rethin(
+def thin(
     states: Bytes2,
     distance: Singles2,
     pixels: Int32s1,
@@ -152,29 +159,3 @@ def rethin(
         keep_pairs = False
         n = kept
     return left[:n].copy()
-
-
-@kernel(writes=("states",))
-def thin(states: Bytes2, distance: Singles2, min_end_depth: float) -> Int32s1:
-    """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
-
-    Parameters and result as in `rethin`.
-    """
-    flat = states.ravel()
-    depth = distance.ravel()
-    found = np.empty(len(flat), np.int32)
-    level = np.empty(len(flat), np.uint16)
-    start = np.zeros(int(DEEPEST * LEVELS_PER_PIXEL) + 2, np.int64)
-    n = 0
-    for p in range(len(flat)):
-        if flat[p] == ROAD:
-            found[n] = p
-            level[n] = np.uint16(min(depth[p], DEEPEST) * LEVELS_PER_PIXEL)
-            start[level[n] + 1] += 1
-            n += 1
-    start = np.cumsum(start)
-    order = np.empty(n, np.int32)
-    for i in range(n):
-        order[start[level[i]]] = found[i]
-        start[level[i]] += 1
-    return rethin(states, distance, order, min_end_depth, True)

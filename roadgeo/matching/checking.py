@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.geometry.camera import pose
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -129,7 +128,7 @@ def _locate(given: Place, query: Query, options: CheckOptions, beyond: bool) -> 
 
 def _as_hints(given: Place, options: CheckOptions) -> LocateOptions:
     """Return the given place, scale, heading and tilt as what is known of a query."""
-    view, (lon, lat), usual = pose(given.matrix, given.scene.size), given.lonlat.tolist(), LocateOptions()
+    view, (lon, lat), usual = given.view, given.lonlat.tolist(), LocateOptions()
     camera = replace(
         usual.match.camera,
         gsd_m=(view.gsd_m / _SCALED, view.gsd_m * _SCALED),

@@ -31,7 +31,7 @@ from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scen
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
-from roadgeo.matching.scene import AGREE_DEG, Scene
+from roadgeo.matching.scene import AGREE_DEG
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
     WITHOUT_ROADS,
@@ -106,17 +106,17 @@ class TripleEstimator:
 
     def __init__(
         self,
-        scene: Scene,
+        sweeps: SharedSweeps,
         index: ReferenceIndex,
         options: MatchOptions | None = None,
         near: tuple[float, float, float] | None = None,
         events: Events | None = None,
         ledger: Ledger | None = None,
-        sweeps: SharedSweeps | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
-        The `ledger` and the `sweeps` are shared with the estimators of other parts that are searched with this one.
+        The `sweeps` of a scene and the `ledger` are shared with the estimators of other parts that are searched with
+        this one.
         """
         self.near = near
         self.ledger = ledger or Ledger()
@@ -130,15 +130,13 @@ class TripleEstimator:
         self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
         self._equals_of: list[Place] = []  # whose own tuples were looked for elsewhere
         self._whole: list[Place] = []  # verified, and no better version of them is to be expected
-        self.scene = scene
-        self.index = index
+        self.sweeps, self.scene, self.index = sweeps, sweeps.scene, index
         self.options = options or MatchOptions()
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
         self._n_rounds, self._n_by_roads, self._anchors = 0, 0, set[int]()
-        self.sweeps = sweeps or SharedSweeps(scene, camera)
-        self.sweeps.members.append(self)
+        sweeps.members.append(self)
         self.in_company = False  # whether it is searched with others first, by triples, and then alone
 
     def leave_company(self) -> None:

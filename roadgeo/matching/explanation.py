@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from roadgeo._version import __version__
-from roadgeo.geometry.camera import CameraFault, CameraOptions, pose
+from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location
 from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.methods import Searched, less_than
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
@@ -85,7 +86,7 @@ class Told:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
         place, plane = self.place, self.place.index.plane
-        camera, agreement = pose(place.matrix, place.scene.size), place.agreement
+        camera, agreement = place.view, place.agreement
         x, y = plane.to_crs(place.center).tolist()
         lon, lat = place.lonlat.tolist()
         matched = int((place.matches[0] >= 0).sum())
@@ -249,7 +250,8 @@ class _Course:
         """Verify the best places that the camera's limits refused without these limits, and score them."""
         scene, index, options = self.estimator.scene, self.estimator.index, self.estimator.options
         camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-        free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=self.estimator.ledger)
+        sweeps = SharedSweeps(scene, camera)
+        free = TripleEstimator(sweeps, index, replace(options, camera=camera), ledger=self.estimator.ledger)
         refusals = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
         refused = [
             (fault, Place(scene, index, matrix / matrix[2, 2], by_roads=False))
@@ -356,7 +358,7 @@ def _number(value: float) -> str:
 
 def _objection(place: Place) -> str:
     """Return the camera's objection to a place, and its score otherwise."""
-    camera = pose(place.matrix, place.scene.size)
+    camera = place.view
     values = {
         CameraFault.SAMPLING: f" ({camera.gsd_m:.2f} m per pixel)",
         CameraFault.TILT: f" ({camera.tilt_deg:.0f} degrees)",

@@ -269,7 +269,7 @@ def _begin(
         part = _part(index, near[:2], reach)
         if len(part) == 0:
             return Searched(index, events=events)
-    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
+    estimator = TripleEstimator(sweeps, part, _of_effort(options), near, events, ledger)
     return Searched(index, n_searched=len(part), events=events, estimator=estimator)
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.geometry.camera import CameraFault, sampling
+from roadgeo.geometry.camera import CameraFault, CameraPose, pose, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import metres_apart, to_lonlat
@@ -90,6 +90,11 @@ class Place:
     def gsd_m(self) -> float:
         """Ground sampling at the middle of the frame, metres per pixel."""
         return sampling(self.matrix, self.scene.size)
+
+    @cached_property
+    def view(self) -> CameraPose:
+        """The camera that sees it so."""
+        return pose(self.matrix, self.scene.size)
 
     @cached_property
     def center(self) -> FloatArray:

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from roadgeo._text import counted
-from roadgeo.geometry.camera import CameraOptions, pose
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
@@ -300,14 +300,14 @@ def _why_nothing(
         return Reason.TIME_LIMIT, sentence
     return (
         Reason.NOTHING_STANDS_OUT,
-        f"no place {where} stands out: {best}{within}; {_what_may_help(query, listed, options)}",
+        f"no place {where} stands out: {best}{within}; {_what_may_help(listed, options)}",
     )
 
 
-def _what_may_help(query: Query, listed: Sequence[Place], options: LocateOptions) -> str:
+def _what_may_help(listed: Sequence[Place], options: LocateOptions) -> str:
     """List what may decide: more to see, and the missing hints, with the number of listed places that each leaves."""
     camera, usual = options.match.camera, CameraOptions()
-    views = [pose(place.matrix, query.scene.size) for place in listed]
+    views = [place.view for place in listed]
     turned = [abs((view.rotation_deg - views[0].rotation_deg + 180.0) % 360.0 - 180.0) for view in views]
     scaled = [abs(math.log(view.gsd_m / views[0].gsd_m)) for view in views]
     away = [listed[0].apart_m(place) for place in listed]

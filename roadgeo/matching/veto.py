@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from roadgeo.geometry.areas import lies_in
-from roadgeo.geometry.camera import CameraOptions, pose
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.methods import Searched, may_show, search_references
@@ -94,8 +94,7 @@ def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:
 
 def _is_other(hinted: Place, place: Place) -> bool:
     """Return whether a place is another than the hinted one: elsewhere, turned, or of another size."""
-    size = hinted.scene.size
-    turn = pose(hinted.matrix, size).rotation_deg - pose(place.matrix, size).rotation_deg
+    turn = hinted.view.rotation_deg - place.view.rotation_deg
     is_turned = abs((turn + 180.0) % 360.0 - 180.0) > _TURNED_DEG
     return is_turned or abs(math.log(place.gsd_m / hinted.gsd_m)) > math.log(_SCALED) or not place.same(hinted)
 

@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane
-from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
+from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, shallow_first, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
 from roadgeo.roads.graph import RoadGraph
 
@@ -321,14 +321,14 @@ class _Skeleton:
 
 def _skeletonize(states: AnyArray, distance: Float32Array, width: float) -> _Skeleton:
     """Thin, then prune and bridge until nothing is left to do. `states` is changed; lengths in its pixels."""
-    flat = states.ravel()
-    room = np.empty(len(flat), np.int32)
-    pixels = thin(states, distance, max(0.25 * width, 1.0))  # ends of roads half as wide as most are kept
+    room = np.empty(states.size, np.int32)
+    pixels, least_end = shallow_first(states, distance), max(0.25 * width, 1.0)  # of roads half as wide as most
     bridged = False
-    for round_ in range(_MAX_ROUNDS):
+    for round_ in range(_MAX_ROUNDS + 1):
+        pixels = thin(states, distance, pixels, 0.0 if round_ else least_end, round_ == 0)
         skeleton = _Skeleton(*trace(states, pixels, room))
-        if len(skeleton.edges) > _MAX_PIECES:
-            return skeleton
+        if round_ == _MAX_ROUNDS or len(skeleton.edges) > _MAX_PIECES:
+            break
         drop = _spurs(skeleton, distance, _SPUR * width) | _pieces(skeleton, _PIECE * width)
         _erase(states, skeleton, drop)
         bridges = np.empty(0, np.int32)
@@ -336,9 +336,9 @@ def _skeletonize(states: AnyArray, distance: Float32Array, width: float) -> _Ske
             bridges = _bridges(states, distance, skeleton, ~drop, width)
             bridged = True
         if bridged and not drop.any() and len(bridges) == 0:
-            return skeleton
-        pixels = rethin(states, distance, np.concatenate((pixels, bridges)), 0.0, False)
-    return _Skeleton(*trace(states, pixels, room))
+            break
+        pixels = np.concatenate((pixels, bridges))
+    return skeleton
 
 
 def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> BoolArray:

@@ -18,7 +18,6 @@ __all__ = [
     "allowed_drivers",
     "are_skipped",
     "forget_missing_proj_data",
-    "is_named_remote",
     "skip_drivers",
     "skipping",
 ]
@@ -90,8 +89,3 @@ def forget_missing_proj_data() -> None:
 def allowed_drivers() -> list[str]:
     """Return the further drivers that the user allows."""
     return [name.strip() for name in os.environ.get(CONSENT, "").split(",") if name.strip()]
-
-
-def is_named_remote(path: str | os.PathLike[str]) -> bool:
-    """Whether the user typed a GDAL file system (/vsicurl/, /vsizip/, ...): then its network is wanted."""
-    return os.fspath(path).startswith("/vsi") and not Path(path).exists()

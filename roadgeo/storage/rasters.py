@@ -27,7 +27,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.fence import is_inside, remedy
-from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, is_named_remote, skipping
+from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, skipping
 from roadgeo.storage.orientation import (
     UPRIGHT,
     read_orientation,
@@ -133,7 +133,7 @@ def open_raster(
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     name = name or os.fspath(path)
-    remote = is_named_remote(path)
+    remote = _is_remote(path)
     page = _PAGE.fullmatch(os.fspath(path)) if isinstance(path, str) else None
     path = page[2] if page else path
     if remote:
@@ -189,7 +189,7 @@ def raster_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         As of `open_raster`.
     """
     with open_raster(path, upright=False) as dataset:
-        orientation = _orientation(dataset, path, is_named_remote(path))
+        orientation = _orientation(dataset, path, _is_remote(path))
         width, height = dataset.width, dataset.height
     return (width, height) if orientation < 5 else (height, width)
 
@@ -228,10 +228,15 @@ def _doubt(reason: str, path: Path) -> str:
     return ""
 
 
+def _is_remote(path: str | os.PathLike[str]) -> bool:
+    """Whether the user typed a GDAL file system (/vsicurl/, /vsizip/, ...): then its network is wanted."""
+    return os.fspath(path).startswith("/vsi") and not Path(path).exists()
+
+
 def require_there(path: str) -> None:
     """Raise `MaskError` where the file of a picture, or of a page of one, is missing; what is remote may be there."""
     page = _PAGE.fullmatch(path)
-    if not is_named_remote(path):
+    if not _is_remote(path):
         require_file(page[2] if page else path, path)
 
 

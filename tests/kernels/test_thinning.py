@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from naive import thinning as naive
 from scipy import ndimage
 
-from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
+from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, shallow_first, thin
 
 #: Steps to neighbours are unsigned, modulo 2**64; without compilation numpy warns where they wrap.
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar add:RuntimeWarning")
@@ -25,9 +25,14 @@ def depth(states: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
 
 
+def thin_all(states: np.ndarray, min_end_depth: float) -> np.ndarray:
+    """Thin all roads, in place; return the pixels left."""
+    return thin(states, depth(states), shallow_first(states, depth(states)), min_end_depth, True)
+
+
 def thinned(states: np.ndarray, min_end_depth: float = 1.0) -> np.ndarray:
     left = states.copy()
-    pixels = thin(left, depth(states), min_end_depth)
+    pixels = thin_all(left, min_end_depth)
     assert sorted(pixels) == np.flatnonzero(left == ROAD).tolist()
     return left
 
@@ -49,7 +54,7 @@ def test_thin_equals_its_slow_twin(states: np.ndarray, min_end_depth: float) -> 
     expected = states.copy()
     left = naive.thin(expected, depth(states), min_end_depth)
     actual = states.copy()
-    assert sorted(thin(actual, depth(states), min_end_depth)) == sorted(left)
+    assert sorted(thin_all(actual, min_end_depth)) == sorted(left)
     np.testing.assert_array_equal(actual, expected)
 
 
@@ -68,7 +73,7 @@ def test_small_pictures(picture: str, expected: str) -> None:
     if picture:
         np.testing.assert_array_equal(thinned(framed(picture)), framed(expected))
     else:
-        assert len(thin(np.full((2, 2), SOLID, np.uint8), np.zeros((2, 2), np.float32), 1.0)) == 0
+        assert len(thin_all(np.full((2, 2), SOLID, np.uint8), 1.0)) == 0
 
 
 def test_a_bump_leaves_no_hair_but_a_road_keeps_its_end() -> None:
@@ -94,9 +99,9 @@ def test_a_road_of_even_width_is_not_eaten_from_its_end(width: int, turns: int) 
     assert 31 - width / 2 - 1 <= np.count_nonzero(left == ROAD) <= 31
 
 
-def test_rethin_takes_stale_and_repeated_pixels() -> None:
+def test_stale_and_repeated_pixels_are_taken() -> None:
     states = framed("..... .###. ..#.. .....")
     pixels = np.flatnonzero(states == ROAD).astype(np.int32)
     states.ravel()[pixels[0]] = GROUND
-    left = rethin(states, depth(states), np.concatenate((pixels, pixels)), 0.0, False)
+    left = thin(states, depth(states), np.concatenate((pixels, pixels)), 0.0, False)
     assert set(left) == set(np.flatnonzero(states == ROAD))

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from kernels.test_thinning import depth, framed, random_states
+from kernels.test_thinning import depth, framed, random_states, thin_all
 from naive import tracing as naive
 
-from roadgeo.kernels.thinning import ROAD, thin
+from roadgeo.kernels.thinning import ROAD, shallow_first, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
 
 Traced = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -22,7 +22,7 @@ def traced(states: np.ndarray) -> Traced:
 
 @given(random_states())
 def test_trace_equals_its_slow_twin(states: np.ndarray) -> None:
-    thin(states, depth(states), 1.0)
+    thin_all(states, 1.0)
     xy, is_open, edges, chain, offsets = traced(states)
     nodes, chains = naive.trace(states)
     centres = {tuple(np.round(np.mean(list(node), axis=0)[::-1], 9)): node for node in nodes}
@@ -65,7 +65,7 @@ def test_nothing_to_trace() -> None:
 @given(random_states(), st.integers(0, 4), st.integers(1, 4), st.integers(0, 9))
 def test_smooth_chains_equals_its_slow_twin(states: np.ndarray, passes: int, spacing: int, trim: int) -> None:
     distance = np.minimum(depth(states), 100)
-    thin(states, distance, 1.0)
+    thin(states, distance, shallow_first(states, distance), 1.0, True)
     xy, _, edges, chain, offsets = traced(states)
     trims = (np.arange(2 * len(edges)).reshape(-1, 2) * trim) % 5
     ends = xy[edges].reshape(-1, 4)
@@ -81,7 +81,7 @@ def test_an_even_road_is_centred_between_two_pixels() -> None:
     states = np.zeros((20, 40), np.uint8)
     states[6:12, 2:38] = ROAD
     distance = cv2.distanceTransform(states, cv2.DIST_L2, 5)
-    thin(states, distance, 1.0)
+    thin(states, distance, shallow_first(states, distance), 1.0, True)
     xy, _, edges, chain, offsets = traced(states)
     coords, _ = smooth_chains(distance, chain, offsets, xy[edges].reshape(-1, 4), np.zeros((1, 2), np.int64), 0, 1)
     middle = coords[np.abs(coords[:, 0] - 20) < 10]

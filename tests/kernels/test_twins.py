@@ -60,7 +60,6 @@ REASONS = {
     "neighbour_steps": "part of thinning and tracing, whose twins use rows and columns",
     "neighbours": "part of thinning and tracing, whose twins use rows and columns",
     "pair_id": "compared with the numbers it counts through, all of them",
-    "rethin": "the second half of `thin`, which has a twin",
     "sample_edges": "compared with shapely's interpolation along lines",
     "solve_cholesky": "compared with numpy.linalg",
     "solve_system": "a test states its two cases",

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matching.test_explanation import mask_of
 from worlds.motorways import motorways
-from worlds.scenes import camera, look, mapped, random_network, scene_of
+from worlds.scenes import camera, estimator_of, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraFault
-from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.index import build_index
 from roadgeo.matching.place import Place, Weight
@@ -123,7 +122,7 @@ def test_without_any_nothing_changes(town):
 @pytest.mark.parametrize("fault", [None, CameraFault.TILT])
 def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, seen, monkeypatch, fault):
     truth, scene = seen
-    estimator = TripleEstimator(scene, town[1])
+    estimator = estimator_of(scene, town[1])
     monkeypatch.setattr(estimator, "judge", lambda matrix, rough=False: fault)
     given = fit(truth, scene, town[1])
     nothing = np.full(len(scene.intersections), -1)

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from shapely import affinity
-from worlds.scenes import PLANE, camera, look, random_lines, scene_of
+from worlds.scenes import PLANE, camera, estimator_of, look, random_lines, scene_of
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Seconds
-from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
@@ -41,7 +40,7 @@ def twice():
 
 def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
     query, index, there = twice
-    estimator = TripleEstimator(query.scene, index)
+    estimator = estimator_of(query.scene, index)
     place, _ = estimator.settle(Place(query.scene, index, TRUTH))
     assert not estimator.look_for_equals(place, deadline=0.0)
     assert not any(np.hypot(*(other.center - there)) < 5.0 for other in estimator.verified)
@@ -58,7 +57,7 @@ def test_an_equal_place_that_the_hints_exclude_is_no_rival(twice):
     query, index, there = twice
     center = Homography(TRUTH).everywhere(query.scene.center)
     reach_m = np.hypot(*(there - center)) - 200.0  # its first guess may lie within a frame of the circle
-    estimator = TripleEstimator(query.scene, index, near=(*center, reach_m))
+    estimator = estimator_of(query.scene, index, near=(*center, reach_m))
     place, _ = estimator.settle(Place(query.scene, index, TRUTH))
     estimator.look_for_equals(place)
     assert estimator.n_hypotheses > 0

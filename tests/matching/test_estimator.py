@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of, search
+from worlds.scenes import Sight, camera, estimator_of, look, mapped, random_network, scene_of, search
 
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import growing
-from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search_together
@@ -18,7 +18,7 @@ ACCEPT = SearchOptions().accept
 
 
 def locate(scene, index, options=None, near=None, limits=None):
-    estimator = TripleEstimator(scene, index, options, near)
+    estimator = estimator_of(scene, index, options, near)
     return search(estimator, limits), estimator
 
 
@@ -102,7 +102,7 @@ def test_places_on_many_maps_are_bounded_as_on_one(town):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
     options = MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=False)
     ledger = Ledger(n_reference=3 * len(town[1]))
-    parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
+    parts = [estimator_of(stranger, town[1], options, ledger=ledger) for _ in range(3)]
     search_together([Search(part) for part in parts], SearchOptions(time_limit_s=60.0))
     assert ledger.n_tried == ledger.n_by_triples == sum(part.n_screened for part in parts)
     assert 40 <= ledger.n_tried < 40 + max(part.n_screened for part in parts)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from worlds.scenes import Sight, mapped, sight_of
+from worlds.scenes import Sight, estimator_of, mapped, sight_of
 
-from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.finishing import measure_corners, refine_beside, with_honest_corners
 from roadgeo.matching.place import Place, Weight
@@ -25,7 +25,7 @@ def test_only_places_that_may_be_reported_are_fitted_to_the_whole_frame(town, sc
     rough, weight = Refined(matrix, 1.0, np.eye(8)), Weight(20.0, 480.0)
     compared = Place(scene, town[1], matrix, grown=nothing, refined=rough, score=score, by=weight)
     vars(compared)["agreement"] = Agreement(agreeing, 0.8)
-    best = measure_corners(TripleEstimator(scene, town[1], MatchOptions(within=within)), compared)
+    best = measure_corners(estimator_of(scene, town[1], MatchOptions(within=within)), compared)
     gaps = np.hypot(*(mapped(best.refined.matrix, scene.corners) - mapped(truth, scene.corners)).T)
     assert (gaps.max() < 1.5) == mended
     assert (best.score, best.by) == (score, weight)  # the answer rests on it

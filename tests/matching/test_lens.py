@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, mapped, random_network, search, shaken, sight_of
+from worlds.scenes import Sight, estimator_of, mapped, random_network, search, shaken, sight_of
 
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching import finishing
-from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events
 from roadgeo.matching.finishing import with_honest_corners
 from roadgeo.matching.lens import _core, find_lens, fit_lens, grow_whole, straighten_scene
@@ -169,7 +168,7 @@ def test_a_place_that_is_grown_anew_behind_a_lens_is_told_as_grown_once(town):
 
     _, elsewhere = sight_of(random_network(77), 5, sight=Sight(0.6))
     events = Events(kept=True)
-    search(TripleEstimator(elsewhere, town[1], events=events))
+    search(estimator_of(elsewhere, town[1], events=events))
     grew = [id(matrix) for grown in events.of("grown") for matrix in grown]
     assert len(set(grew)) == len(grew) > 0
 
@@ -179,7 +178,7 @@ def test_a_search_finds_what_a_lens_saw(town, k1):
     """Also where the lens bends so much that a pinhole fits one part of the frame only."""
     truth, straight = sight_of(town[0], 5, tilt=10, sight=Sight(0.6))
     scene = through_lens(straight, k1)
-    result = search(TripleEstimator(scene, town[1]))
+    result = search(estimator_of(scene, town[1]))
     refined = result.best.refined
     assert result.score > SearchOptions().accept
     assert refined.lens_k1 == pytest.approx(k1, abs=0.005)

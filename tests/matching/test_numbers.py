@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from worlds.lattices import contest
-from worlds.scenes import Sight, camera, look, scene_of
+from worlds.scenes import Sight, camera, estimator_of, look, scene_of
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import rivals, verdict
-from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence, _anyhow, _log_ratios, statement_px, tolerance_m
 from roadgeo.matching.options import LocateOptions
@@ -97,7 +96,7 @@ def scored(place, score):
 @pytest.mark.parametrize(("by_picture", "score"), [(4.0, 6.0 + 0.5 * 4.0), (9.0, 9.0 + 0.5 * 6.0), (-5.0, 6.0)])
 def test_half_of_the_lesser_lead_counts_where_roads_and_a_soft_picture_agree(lattice, monkeypatch, by_picture, score):
     truth, index, evidence = lattice
-    estimator = TripleEstimator(evidence.scene, index)
+    estimator = estimator_of(evidence.scene, index)
     estimator.scene = replace(evidence.scene, probability=np.zeros((2, 2), np.float32))
     place, part = Place(evidence.scene, index, truth), Search(estimator)
     compared = Rivals({part: estimator}, Ledger(n_reference=866), 3.5)
@@ -126,7 +125,7 @@ def test_a_place_is_certain_where_it_leads_by_12_nothing_speaks_against_it_and_s
     lattice, monkeypatch, nearby, contradicted, lead, is_certain
 ):
     truth, index, evidence = lattice
-    estimator = TripleEstimator(evidence.scene, index)
+    estimator = estimator_of(evidence.scene, index)
     place = scored(Place(evidence.scene, index, truth), lead)
     vars(place).update(contradicted=contradicted, refined=object())
     monkeypatch.setattr(estimator, "nearby", lambda _: nearby * place.log10_likelihood)
@@ -138,7 +137,7 @@ def test_a_place_is_certain_where_it_leads_by_12_nothing_speaks_against_it_and_s
 @pytest.mark.parametrize(("share", "is_searched"), [(0.4, False), (0.6, True)])
 def test_streets_around_are_searched_where_half_of_the_lead_needed_is_there(lattice, monkeypatch, share, is_searched):
     truth, index, evidence = lattice
-    estimator, reached = TripleEstimator(evidence.scene, index), []
+    estimator, reached = estimator_of(evidence.scene, index), []
     place = scored(Place(evidence.scene, index, truth), 5.0)
     explained = place.log10_likelihood
     vars(place).update(contradicted=explained * (1.0 - share) / 60.0, refined=object())
@@ -154,7 +153,7 @@ def test_streets_around_are_searched_where_half_of_the_lead_needed_is_there(latt
 def test_another_place_lies_apart_and_meets_other_roads(lattice, monkeypatch, east_m, shared, is_rival):
     """By 4 hundredths of half the frame's diagonal, 23 m here, and a third of its roads."""
     truth, index, evidence = lattice
-    estimator = TripleEstimator(evidence.scene, index)
+    estimator = estimator_of(evidence.scene, index)
     place, other = (scored(Place(evidence.scene, index, shifted(truth, east, 0.0)), 5.0) for east in (0.0, east_m))
     vars(place).update(contradicted=0.0, refined=object())
     monkeypatch.setattr(Evidence, "shared", lambda *_: shared)

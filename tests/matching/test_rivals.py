@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from worlds.lattices import beside, contest
-from worlds.scenes import Sight, camera, look, scene_of
+from worlds.scenes import Sight, camera, estimator_of, look, scene_of
 
 from roadgeo.geometry.camera import CameraOptions, pose, sampling
 from roadgeo.geometry.homography import Homography
@@ -38,7 +38,7 @@ def even():
 def search_of(world, *matrices, near=None, match=None):
     """A search that met these places, and its estimator."""
     _, index, evidence = world
-    estimator = TripleEstimator(evidence.scene, index, match, near)
+    estimator = estimator_of(evidence.scene, index, match, near)
     for matrix in matrices:
         estimator.settle(Place(evidence.scene, index, matrix))
     return Search(estimator), estimator
@@ -288,7 +288,7 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     truth, index, evidence = plain
     soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
     elsewhere = move_about(Homography(truth)(soft.center), Shift(700.0, 300.0, 0.0, 1.0, 0.0)) @ truth
-    estimator = TripleEstimator(soft, index)
+    estimator = estimator_of(soft, index)
     item = Search(estimator)
     here, there = (Place(soft, index, matrix) for matrix in (truth, truth if is_same else elsewhere))
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
@@ -300,7 +300,7 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
 def test_the_picture_takes_a_rival_that_leads_by_what_is_needed(plain, monkeypatch, by, n_compared):
     truth, index, evidence = plain
     soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
-    estimator = TripleEstimator(soft, index)
+    estimator = estimator_of(soft, index)
     estimator.settle(Place(soft, index, truth))
     compared: list[Place] = []
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of, search
+from worlds.scenes import Sight, camera, estimator_of, look, mapped, random_network, scene_of, search
 
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import road_search
-from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.index import build_index
 from roadgeo.matching.road_search import (
     COARSE_PIXEL_M,
@@ -106,9 +106,9 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     network, index = town
     scene = scene_of(look(network, TRUTH, sight=Sight(0.8, missing=0.6, false=0.3), seed=seed))
     limits = SearchOptions(time_limit_s=60.0)
-    quick = search(TripleEstimator(scene, index, MatchOptions(roads=False, without_roads=WITHOUT_ROADS[:2])), limits)
+    quick = search(estimator_of(scene, index, MatchOptions(roads=False, without_roads=WITHOUT_ROADS[:2])), limits)
     assert quick.score < 3.5
-    full = search(TripleEstimator(scene, index, MatchOptions()), limits)
+    full = search(estimator_of(scene, index, MatchOptions()), limits)
     assert full.score > 6
     assert corner_gap(full.best.refined.matrix, scene) < 6
     assert full.best.by_roads
@@ -219,7 +219,7 @@ def test_distances_lie_in_rings():
 
 def test_a_map_of_few_roads(broken):
     index = build_index(random_network(7, 400.0))
-    result = search(TripleEstimator(broken, index, MatchOptions()))
+    result = search(estimator_of(broken, index, MatchOptions()))
     assert result.score < 2.5
 
 

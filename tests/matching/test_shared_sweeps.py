@@ -143,7 +143,7 @@ def towns():
 
 def search_all(scene, indexes, options=None):
     ledger, sweeps = Ledger(sum(map(len, indexes))), SharedSweeps(scene, CameraOptions())
-    estimators = [TripleEstimator(scene, index, options, ledger=ledger, sweeps=sweeps) for index in indexes]
+    estimators = [TripleEstimator(sweeps, index, options, ledger=ledger) for index in indexes]
     parts = {Search(estimator): estimator for estimator in estimators}
     search_together(list(parts), SearchOptions(time_limit_s=60.0), Rivals(parts, ledger, 3.5))
     return list(parts)

@@ -9,6 +9,8 @@ import shapely
 from scipy.spatial import Delaunay
 
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.scene import Scene, prepare_scene
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.roads.graph import RoadGraph
@@ -16,7 +18,10 @@ from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
 from worlds.drawn import camera, mapped
 
-__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of", "search", "soft"]
+__all__ = [
+    *("PLANE", "Sight", "camera", "estimator_of", "look", "mapped", "random_lines", "random_network", "scene_of"),
+    *("search", "soft"),
+]
 
 PLANE = LocalPlane("EPSG:32619", (330000.0, 4690000.0))
 
@@ -162,6 +167,12 @@ def soft(scene, strength=1.0, seed=0):
     odds = strength * (4.0 - 0.5 * away_m + 4.0 * noise)
     probability = np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -5.0, 5.0))), np.float32)
     return replace(scene, probability=probability)
+
+
+def estimator_of(scene, index, options: MatchOptions | None = None, *more, **named) -> TripleEstimator:
+    """What searches a part by itself."""
+    options = options or MatchOptions()
+    return TripleEstimator(SharedSweeps(scene, options.camera), index, options, *more, **named)
 
 
 def search(estimator, limits: SearchOptions | None = None) -> Search:
