@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import html
+import logging
+import numbers
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-__all__ = ["counted", "in_html", "listed", "read_moment", "visible"]
+__all__ = ["counted", "in_html", "listed", "log_of", "read_moment", "visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -38,6 +40,19 @@ def counted(number: int, noun: str) -> str:
 def listed(names: Sequence[str], most: int = 8) -> str:
     """Return names for a message: "a, b and 3 more"."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def log_of(module: str) -> logging.Logger:
+    """Return a module's log; texts in its lines are written as `visible` does."""
+    log = logging.getLogger(module)
+    log.addFilter(_show)
+    return log
+
+
+def _show(record: logging.LogRecord) -> bool:
+    if isinstance(record.args, tuple):
+        record.args = tuple(arg if isinstance(arg, numbers.Number) else visible(str(arg)) for arg in record.args)
+    return True
 
 
 def _escape(match: re.Match[str]) -> str:

@@ -99,6 +99,11 @@ def test_commands_print_in_one_place() -> None:
     assert printing == ["printing.py"]
 
 
+def test_logs_are_made_in_one_place() -> None:
+    """Their lines show what names may hold besides text; kernels tell of themselves only."""
+    assert [path.name for path in modules() if "getLogger(__name__)" in path.read_text()] == ["compilation.py"]
+
+
 def test_points_are_divided_by_w_in_one_place() -> None:
     """`geometry.homography` maps points; kernels, which know no classes, map their own; so does the plugin."""
     dividing = re.compile(r"\[[^\]]*:2\]\s*/\s*\w+\[[^\]]*\b2:?\]")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -15,7 +14,7 @@ import click
 
 from roadgeo._options import IMAGE, RESULTS, SEARCH, option, part, take
 from roadgeo._progress import say_nothing
-from roadgeo._text import visible
+from roadgeo._text import log_of, visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.command_line import said_options
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
 
 __all__ = ["describe", "locate_command", "pair_images"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Options without an effect on a result, or with a value for each mask.
 _OF_NO_ACCOUNT = {
@@ -238,8 +237,7 @@ def _photograph_of(mask: str, pictures: Sequence[Path], folder: str) -> str:
     for name in dict.fromkeys((stem.removesuffix("_mask"), stem)):
         named = [path for path in others if path.stem == name]
         if len(named) > 1:
-            chosen, other = (visible(str(path)) for path in named[:2])
-            _LOG.warning("%s: %s is drawn, though %s has its name, too", visible(mask), chosen, other)
+            _LOG.warning("%s: %s is drawn, though %s has its name, too", mask, *named[:2])
         if named:
             return str(named[0])
     raise click.UsageError(f"No photograph in {folder} has the name of {mask}.")

@@ -5,7 +5,6 @@ Memory holds two frames at a time. The motion of a frame comes from a file, from
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import tempfile
@@ -21,7 +20,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.flights.motion import Odometer, between_images
 from roadgeo.flights.strips import place_strips
@@ -41,7 +40,7 @@ from roadgeo.storage.rasters import count_frames, is_raster, pages_of
 
 __all__ = ["FrameOptions", "follow_frames", "read_frames", "read_stills"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Frames a second of a video that states none, or none that makes sense.
 _USUAL_RATE = 25.0
@@ -265,7 +264,7 @@ def _video(
     stack.callback(video.release)
     if not video.isOpened():
         raise MaskError(f"{path}: no video that OpenCV reads; give its frames as images")
-    rate, name = video.get(cv2.CAP_PROP_FPS), visible(Path(path).name)
+    rate, name = video.get(cv2.CAP_PROP_FPS), Path(path).name
     step_s = 1.0 / rate if 0.01 < rate < 10_000 else 1.0 / _USUAL_RATE
     aspect = options.aspect or _aspect_of(video, name)
     taken, next_s, at_s, shift_s = 0, 0.0, -step_s, 0.0

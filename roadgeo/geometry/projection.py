@@ -5,7 +5,6 @@ Longitude comes before latitude everywhere. pyproj is imported on first use.
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo._text import log_of
 from roadgeo.errors import CrsError
 from roadgeo.geometry.homography import shift
 from roadgeo.geometry.transformation import exactness
@@ -35,7 +35,7 @@ __all__ = [
     "transformer",
 ]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 _EARTH_RADIUS_M = 6.371e6
 

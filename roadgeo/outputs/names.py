@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import logging
 import os.path
 import re
 import shlex
@@ -15,11 +14,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
-from roadgeo._text import visible
+from roadgeo._text import log_of, visible
 
 __all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "table_cell", "table_text", "without_folders"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: The folders of a path from the root on, of Windows too; a URL's are kept.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[/\\]+(?:[^/\\\s:;,'\"]+[/\\])+")
@@ -46,7 +45,7 @@ def name_for_odm(name: str) -> str:
     """Return a picture's name for OpenDroneMap's tables, and warn of spaces, which part columns there."""
     if re.search(r"\s", name):
         text = "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
-        _LOG.warning(text, visible(name))
+        _LOG.warning(text, name)
     return visible(name)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import os
 import shlex
 from collections.abc import Callable, Mapping
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._progress import Say
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError, Reason, RoadgeoError, is_of_memory, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Locating", "Outcome", "Question", "changed_options"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 
 @dataclass(frozen=True)
@@ -237,7 +236,7 @@ class Locating:
             answer = None
         if answer is None or answer.query != task.query or not answer.places or taken is None:
             require_there(task.mask)
-            _LOG.warning("%s: no earlier answer lies in %s: searching first", visible(task.query), self.out_dir)
+            _LOG.warning("%s: no earlier answer lies in %s: searching first", task.query, self.out_dir)
             return None
         kept = probability_path(paths)
         sighting = take_again(answer, taken, task.mask, kept, question.references, self.options.reading, options)

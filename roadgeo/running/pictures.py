@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import warnings
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from roadgeo._arrays import AnyArray
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError
 from roadgeo.geometry.georeference import Georeference, stretch_of
 from roadgeo.roads.thresholds import are_labels
@@ -22,7 +22,7 @@ from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
 __all__ = ["PilImage", "RasterioDataset", "XarrayArray", "as_file", "pixels_of", "read_picture"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 _SUBFILE_TYPE = 254  # a tag of TIFF
 #: Names of the axes of a picture, and of the columns where they are degrees.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
@@ -32,7 +31,7 @@ from roadgeo.workflows import locate
 
 __all__ = ["QueryRoads", "locate_query", "read_roads"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Name in results of a picture that is no file.
 _ARRAY = "array"
@@ -222,7 +221,7 @@ def _locate_lines(
     """Locate roads given as lines; their units restrict scale and north unless the user gives narrower limits."""
     drawing, camera = draw_roads(path, reading.units, reading.layer or None), options.match.camera
     if drawing.middle is not None and swapped_near((*drawing.middle, 1000.0), references) is not None:
-        _LOG.warning("%s: its coordinates lie on none of the maps; %s", visible(path), EXCHANGED)
+        _LOG.warning("%s: its coordinates lie on none of the maps; %s", path, EXCHANGED)
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
         scale = (drawing.unit_m / _SCALED, drawing.unit_m * _SCALED)
         tilt = min(camera.max_tilt_deg, _TILTED_DEG)

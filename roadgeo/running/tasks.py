@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import hashlib
 import json
-import logging
 import os
 import re
 from collections import Counter
@@ -14,14 +13,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from roadgeo._text import visible
+from roadgeo._text import log_of, visible
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import JSON, is_result, result_endings
 from roadgeo.running.probability_files import ENDING, is_ours
 
 __all__ = ["SUFFIXES", "VIDEOS", "Task", "find_masks", "in_natural_order", "name_tasks"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Suffixes of the files that a folder is searched for, as `storage.rasters` reads them.
 SUFFIXES = (
@@ -127,7 +126,8 @@ def _in_order(names: Iterable[str]) -> list[str]:
         _LOG.warning(
             "numbers in names are read as decimals: %s comes before %s; where digits after the point are whole numbers "
             "(of nanoseconds, say), give them as many digits each",
-            *(visible(Path(name).name) for name in (ordered[first], whole[first])),
+            Path(ordered[first]).name,
+            Path(whole[first]).name,
         )
     return ordered
 
@@ -143,12 +143,13 @@ def _images_in(folder: Path, recursive: bool, suffixes: tuple[str, ...]) -> list
         hint = "formats that are not read from a folder; convert them, or give them by name"
         if unread.keys() & {*VIDEOS} - {*suffixes}:
             hint = "of videos take frames, or follow them with `roadgeo track`"
-        _LOG.warning("%s: passed over: %s: %s", visible(str(folder)), visible(listed), hint)
+        _LOG.warning("%s: passed over: %s: %s", folder, listed, hint)
     beyond = [] if recursive else [name for name in images if Path(name).parent != folder]
     if beyond:
         _LOG.warning(
             "%s: images in folders within it, such as %s, are passed over; --recursive takes them too",
-            *(visible(str(path)) for path in (folder, Path(beyond[0]).relative_to(folder))),
+            folder,
+            Path(beyond[0]).relative_to(folder),
         )
     return [name for name in images if recursive or Path(name).parent == folder]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import shutil
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -21,6 +20,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from roadgeo._text import log_of
 from roadgeo._version import __version__
 from roadgeo.reference.opening import AnyReference
 from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, problem
@@ -34,7 +34,7 @@ from roadgeo.serving.workers import ImageRequest, ImageWorkers, Reply
 
 __all__ = ["Service"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Time to make a file of an answer, seconds.
 _WRITE_S = 60.0

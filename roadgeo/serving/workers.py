@@ -6,7 +6,6 @@ nobody an answer, unless the next one breaks by the same image.
 
 from __future__ import annotations
 
-import logging
 import shutil
 import threading
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
+from roadgeo._text import log_of
 from roadgeo.errors import RoadgeoError
 from roadgeo.running.pool import Lost
 from roadgeo.running.processes import Processes, tell
@@ -27,7 +27,7 @@ from roadgeo.storage.fence import Fence
 
 __all__ = ["Full", "ImageRequest", "ImageWorkers", "Reply", "Serving"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: A process that has not answered this long after its time limit is ended.
 _GRACE_S = 15.0

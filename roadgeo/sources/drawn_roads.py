@@ -5,7 +5,6 @@ They are drawn as a mask would show them, and located like one.
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.homography import shift
 from roadgeo.geometry.mask import RoadMask
@@ -25,7 +24,7 @@ from roadgeo.storage.crs import known_crs
 
 __all__ = ["Drawing", "Units", "draw_roads"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 Units = Literal["auto", "pixels", "metres"]
 
@@ -85,9 +84,9 @@ def draw_roads(
     except RoadSourceError as error:
         raise MaskError(str(error)) from error
     if are_exchanged(read):
-        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", visible(name), EXCHANGED)
+        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", name, EXCHANGED)
     if "part" in read.meta:
-        _LOG.warning("%s: %s", visible(name), read.meta["part"])
+        _LOG.warning("%s: %s", name, read.meta["part"])
     import shapely
     from rasterio.features import rasterize
 

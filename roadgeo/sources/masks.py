@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
-from roadgeo._text import listed, visible
+from roadgeo._text import listed, log_of
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.borders import find_border
@@ -35,7 +34,7 @@ from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
 
 __all__ = ["MaskSource", "is_photograph", "open_mask", "read_mask"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded in strips of this size
@@ -207,7 +206,7 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
         raster, sample = _without_unlabelled(raster, sample)
     number = find_numbered(sample) if threshold is None else None
     if number is not None:
-        _LOG.warning("%s: holds a number for each of its roads: all but its ground is road", visible(raster.name))
+        _LOG.warning("%s: holds a number for each of its roads: all but its ground is road", raster.name)
     threshold = threshold if number is None else number
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
     levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
@@ -238,18 +237,18 @@ def _drawn(raster: Bands, observed: AnyArray, hidden: AnyArray) -> Bands:
     shown = ~_finite(middle, valid)
     is_one = len(observed) > 0 and ((observed == observed[0]).all() or are_patches(middle[..., 0], ~shown))
     if 0 < share <= _MAX_ROAD_SHARE and is_one and are_roads(~shown):
-        _LOG.warning("%s: all that is observed looks like roads: it is taken for them", visible(raster.name))
+        _LOG.warning("%s: all that is observed looks like roads: it is taken for them", raster.name)
         return replace(_where(raster, True), bands=raster.bands[:1])
     edges = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
     if not 1 - _MAX_ROAD_SHARE <= share < 1 or max(edge.mean() for edge in edges) > 0.5 or not are_roads(shown):
         return raster
     if (observed == observed[0]).all():
-        _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", visible(raster.name))
+        _LOG.warning("%s: its roads are nodata, masked or transparent: they are taken for roads", raster.name)
         return replace(_where(raster, False), bands=raster.bands[:1])
     is_lightest = observed.dtype.kind != "f" and (hidden == hidden[0]).all() and hidden.min() > observed.max()
     if not is_lightest or len(np.unique(observed)) <= 2:
         return raster
-    _LOG.warning("%s: its lightest pixels are nodata: they are taken for roads, too", visible(raster.name))
+    _LOG.warning("%s: its lightest pixels are nodata: they are taken for roads, too", raster.name)
     return _changed(raster, lambda values, _: (values, None))
 
 
@@ -292,7 +291,7 @@ def _without_fill(raster: Bands, observed: AnyArray) -> Bands:
             continue
         apart = max(others.min() - float(end), float(end) - others.max())
         if apart > np.ptp(others) and not are_roads((_middle(raster)[0] == end).all(axis=2)):
-            _LOG.warning("%s: its value %g, far from all others, is taken for not observed", visible(raster.name), end)
+            _LOG.warning("%s: its value %g, far from all others, is taken for not observed", raster.name, end)
             return _changed(raster, partial(_all_but, end))
     return raster
 
@@ -332,7 +331,7 @@ def _of_colours(raster: Bands) -> Bands:
         shown = (values != ground).any(axis=2) & _finite(values, valid)
         packed = values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]]
         if np.ptp(values[shown], axis=1).any() and are_roads(shown) and are_patches(packed, shown):
-            _LOG.warning("%s: holds a colour for each of its roads: all but its ground is road", visible(raster.name))
+            _LOG.warning("%s: holds a colour for each of its roads: all but its ground is road", raster.name)
             drawn = _changed(raster, partial(_unlike, ground))
             return replace(drawn, bands=raster.bands[:1])
     return raster
@@ -351,7 +350,7 @@ def _without_unlabelled(raster: Bands, sample: Sample) -> tuple[Bands, Sample]:
     """Leave out pixels without a label in a map of labels, and report how its values were read."""
     unlabelled, reason = find_unlabelled(sample)
     if reason:
-        _LOG.warning("%s: %s; another --threshold tells them apart otherwise", visible(raster.name), reason)
+        _LOG.warning("%s: %s; another --threshold tells them apart otherwise", raster.name, reason)
     if unlabelled is None:
         return raster, sample
 
@@ -447,7 +446,7 @@ def _corrected(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple
     inverted = ~roads if observed is None else observed & ~roads
     if not inverted.any():
         raise MaskError(f"{name}: every pixel is light; expected roads as light pixels on dark ground")
-    _LOG.warning("%s: dark roads on light ground: read as inverted", visible(name))
+    _LOG.warning("%s: dark roads on light ground: read as inverted", name)
     return inverted, observed
 
 
@@ -458,7 +457,7 @@ def _without_border(
     on_map = find_border(roads, road_width_px)
     if on_map is None or not (roads & on_map).any():
         return roads, observed
-    _LOG.warning("%s: what lies beyond the border of the map is left out", visible(name))
+    _LOG.warning("%s: what lies beyond the border of the map is left out", name)
     return roads & on_map, on_map if observed is None else observed & on_map
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import re
 import shutil
@@ -26,7 +25,7 @@ from typing import Any
 from urllib.parse import urljoin, urlsplit
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo._text import counted, visible
+from roadgeo._text import counted, log_of
 from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways
@@ -40,7 +39,7 @@ from roadgeo.storage.vectors import first_line, read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Osmnx's settings, and the way to resolve names that it replaces, are those of the process.
 _ONE_AT_A_TIME = threading.Lock()
@@ -182,7 +181,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     if len(parts) == 0:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
     if part := what_is_missing(path, len(shapes)):
-        _LOG.warning("%s: %s", visible(str(path)), part)
+        _LOG.warning("%s: %s", path, part)
     crs = crs_name(layer.crs)
     if crs is None:
         raise RoadSourceError(f"{path}: has no CRS; save the outline with one, for example as GeoJSON")

@@ -6,7 +6,6 @@ lines that were asked for are chosen and brought to one plane.
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo._progress import Say, say_nothing
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import CrsError, NoRoadsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, to_plane
 from roadgeo.roads.kinds import RoadKind, drives
@@ -43,7 +42,7 @@ __all__ = [
     ),
 ]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
 Box = tuple[float, float, float, float]
@@ -255,7 +254,7 @@ def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
     if own is not None and not known_crs(own).equals(known_crs(named), ignore_axis_order=True):
         _LOG.warning(
             "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
-            visible(str(name)),
+            name,
             known_crs(own).name if len(own) > len("EPSG:123456") else own,
             crs,
         )

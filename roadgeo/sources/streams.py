@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import tempfile
 from collections import Counter
@@ -13,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import NoRoadsError, RoadgeoError, RoadSourceError
 from roadgeo.geometry.projection import transform
 from roadgeo.sources.containers import ENDINGS, stream_tables
@@ -35,7 +34,7 @@ __all__ = [
     "tell_source",
 ]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 #: Files that hold lines, not pixels, by their names.
 QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
@@ -77,7 +76,7 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
     unread = Counter("folder" if file.is_dir() else file.suffix.lower() or "without a suffix" for file in others)
     listed = ", ".join(f"{n} {suffix}" for suffix, n in sorted(unread.items()) if not _BESIDE.fullmatch(suffix))
     if listed:
-        _LOG.warning("%s: passed over: %s: not read from a folder", visible(str(folder)), visible(listed))
+        _LOG.warning("%s: passed over: %s: not read from a folder", folder, listed)
     if not candidates:
         raise RoadSourceError(f"{folder}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
     if len(candidates) == 1:
@@ -102,8 +101,8 @@ def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
     for file, reason in why.items():
         _LOG.warning(
             "%s: passed over: %s; to take it all the same give it by its name",
-            visible(str(folder / file.name)),
-            visible(reason),
+            folder / file.name,
+            reason,
         )
     kept = [file for file in candidates if file not in why]
     if not kept:
@@ -255,7 +254,7 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             "paths too, and --kinds does nothing%s",
             name,
             f"{meta['kept']:,}",
-            f"; --layer chooses by {visible(meta['levels'])}" if "levels" in meta else "",
+            f"; --layer chooses by {meta['levels']}" if "levels" in meta else "",
         )
 
 

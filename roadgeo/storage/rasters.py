@@ -367,7 +367,7 @@ def name_page(path: str, page: int | None) -> str:
 def pages_of(path: str | os.PathLike[str]) -> list[str]:
     """Return the names by which the pages of a TIFF are opened, but for reduced pictures and masks; else the path."""
     name = os.fspath(path)
-    if is_named_remote(path):
+    if _is_remote(path):
         with open_raster(path, upright=False) as dataset:
             return [page for page in dataset.subdatasets if _PAGE.fullmatch(page)] or [name]
     numbers = [] if _PAGE.fullmatch(name) else _whole_pages(Path(path))
@@ -376,7 +376,7 @@ def pages_of(path: str | os.PathLike[str]) -> list[str]:
 
 def count_frames(path: str | os.PathLike[str]) -> int:
     """Return of how many pictures an animation consists, GIF or PNG; 1 of other files."""
-    if is_named_remote(path) or _PAGE.fullmatch(os.fspath(path)):
+    if _is_remote(path) or _PAGE.fullmatch(os.fspath(path)):
         return 1
     with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
         head = file.read(_HEAD_BYTES)

@@ -17,6 +17,7 @@ from roadgeo.cli.locate import locate_command
 from roadgeo.cli.printing import echo, paint, plain
 from roadgeo.errors import MaskError
 from roadgeo.running.tasks import name_tasks
+from roadgeo.sources.streams import tell_source
 
 ESCAPES = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb"
 FORBIDDEN = ("\x1b", "\x07", "\x9b", "\u202e")
@@ -93,6 +94,12 @@ def test_names_of_references_do_not_speak_to_the_terminal(
     said = "".join(capfd.readouterr())
     assert not [item for item in FORBIDDEN if item in said]
     assert "\\x1b]0;owned" in said
+
+
+def test_lines_of_the_log_show_what_names_hold(caplog: pytest.LogCaptureFixture) -> None:
+    tell_source(f"{ESCAPES}.gpkg", {"part": f"layer {ESCAPES} of 2", "kinds_known": True})
+    assert not [item for item in FORBIDDEN if item in caplog.text]
+    assert caplog.text.count("\\x1b]0;owned") == 2
 
 
 @pytest.mark.parametrize("letter", ["a", "ü", "東"])

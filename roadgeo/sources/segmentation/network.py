@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +10,14 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, Float32Array
-from roadgeo._text import listed, visible
+from roadgeo._text import listed, log_of
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.card import TILE_STEP, ModelCard, channels_come_last, read_card, size_of
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, open_onnx
 
 __all__ = ["DEFAULT_MODEL", "Network", "load_network"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 DEFAULT_MODEL = Path(__file__).parent / "model" / "roads.onnx.gz"
 
@@ -196,7 +195,7 @@ def _what_is_seen(network: Network) -> tuple[tuple[int, int], tuple[int, int]]:
         return (rows, columns), (height, width)
     _LOG.warning(
         "%s: gives %d x %d pixels of tiles of %d x %d: taken for their middle",
-        *(visible(network.name), columns, rows, width, height),
+        *(network.name, columns, rows, width, height),
     )
     return (rows, columns), (round(rows * stride), round(columns * stride))
 

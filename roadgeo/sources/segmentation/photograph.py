@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
-from roadgeo._text import visible
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError
 from roadgeo.storage.rasters import MAX_SIDE, open_raster, page_of, read_palette, value_bands
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Photograph", "find_ground", "find_voids", "open_photograph"]
 
-_LOG = logging.getLogger(__name__)
+_LOG = log_of(__name__)
 
 MIN_SIDE = 64
 _SIDES = ("left", "top", "right", "bottom")
@@ -263,7 +262,7 @@ def _report_margins(name: str, box: _Box, size: tuple[int, int]) -> None:
     margins = box.left, box.top, size[0] - box.right, size[1] - box.bottom
     if max(margins) > 0.5:
         listed = ", ".join(f"{px:.0f} px {side}" for px, side in zip(margins, _SIDES, strict=True) if px > 0.5)
-        _LOG.warning("%s: plain margins are not observed: %s", visible(name), listed)
+        _LOG.warning("%s: plain margins are not observed: %s", name, listed)
 
 
 def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> tuple[list[AnyArray], BoolArray]:
@@ -287,7 +286,7 @@ def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> tuple[list[Any
             edges = cv2.dilate(is_fill.view(np.uint8), np.ones((_VOID_CORE_PX, _VOID_CORE_PX), np.uint8)) > 0
             shown = shown & ~edges & (values != fill).any(axis=2)
             listed = ", ".join(f"{value:g}" for value in np.unique(fill))
-            _LOG.warning("%s: areas of the value %s are taken for not observed", visible(name), listed)
+            _LOG.warning("%s: areas of the value %s are taken for not observed", name, listed)
     return fills, shown if shown.any() else valid
 
 
