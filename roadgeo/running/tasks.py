@@ -25,47 +25,16 @@ _LOG = log_of(__name__)
 #: Suffixes of the files that a folder is searched for, as `storage.rasters` reads them.
 SUFFIXES = (
     *(".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".jfif", ".jp2", ".j2k", ".webp", ".png", ".bmp", ".gif"),
-    *(
-        ".pbm",
-        ".pgm",
-        ".ppm",
-        ".pnm",
-        ".pam",
-        ".pfm",
-        ".vrt",
-        ".img",
-        ".npy",
-        ".j2c",
-        ".jpc",
-        ".jpf",
-        ".jpx",
-        ".dib",
-        ".btf",
-        ".tf8",
-        ".gtiff",
-    ),
+    *(".pgm", ".ppm", ".pnm", ".pbm", ".pam", ".pfm", ".vrt", ".img", ".npy"),
+    *(".j2c", ".jpc", ".jpf", ".jpx", ".dib", ".btf", ".tf8", ".gtiff"),
 )
 #: Suffixes of videos as cameras, phones and links write them, of which `track` takes frames.
 VIDEOS = (
     *(".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv", ".mts", ".m2ts", ".m2t", ".mod"),
     *(".tod", ".vob", ".3gp", ".3gpp", ".3g2", ".flv", ".f4v", ".lrv", ".insv", ".360", ".asf", ".ogv", ".ogm", ".mxf"),
     *(".dv", ".m1v", ".m2v", ".mpv", ".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".ivf", ".av1", ".mjpeg"),
-    *(
-        ".mjpg",
-        ".y4m",
-        ".nut",
-        ".divx",
-        ".xvid",
-        ".rm",
-        ".rmvb",
-        ".qt",
-        ".mpe",
-        ".mp4v",
-        ".trp",
-        ".wtv",
-        ".gxf",
-        ".amv",
-    ),
+    *(".mjpg", ".y4m", ".nut", ".divx", ".xvid", ".rm", ".rmvb"),
+    *(".qt", ".mpe", ".mp4v", ".trp", ".wtv", ".gxf", ".amv"),
 )
 #: Files that lie beside pictures, and that nobody expects to be pictures: world files, side files, indexes, text.
 _BESIDE = re.compile(

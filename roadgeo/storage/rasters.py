@@ -464,9 +464,7 @@ def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetRe
         array = _bands_first(_read_array(path))
     except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise MaskError(
-            f"{name}: no array that can be read ({reason}); expected numbers, by numpy.save, or PNM"
-        ) from error
+        raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers") from error
     if array is None or array.dtype.kind not in "biuf":
         what = "" if array is None else f" of {array.dtype}"
         raise MaskError(f"{name}: holds an array{what}; expected (rows, columns) of real numbers, bands first or last")
@@ -493,7 +491,7 @@ def _read_array(path: str | os.PathLike[str]) -> AnyArray:
     array = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
     if array is None:
         raise ValueError("damaged or cut short")
-    return array if array.ndim == 2 else array[..., ::-1]  # which has blue first
+    return array if array.ndim == 2 else array[..., 2::-1]  # blue comes first
 
 
 def _bands_first(array: AnyArray) -> AnyArray | None:
