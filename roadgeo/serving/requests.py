@@ -21,7 +21,8 @@ _MAGIC = {
     b"MM\0+": ".tif",
     b"\xff\xd8\xff": ".jpg",
     b"BM": ".bmp",
-    **dict.fromkeys((b"P4", b"P5", b"P6", b"P7"), ".pnm"),
+    b"GIF8": ".gif",
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7"), ".pnm"),
     b"\0\0\0\x0cjP  ": ".jp2",
 }
 
@@ -60,7 +61,9 @@ def ending_of(head: bytes) -> str:
     for magic, ending in _MAGIC.items():
         if head.startswith(magic):
             return ending
-    raise HTTPException(415, "the body is no image; expected PNG, TIFF, JPEG, WebP, JPEG 2000, BMP or PGM")
+    is_still = head[4:8] == b"ftyp"
+    what = "in HEIC or AVIF, or a video, which are not read: save a picture as JPEG" if is_still else "no image"
+    raise HTTPException(415, f"it is {what}; expected PNG, TIFF, JPEG, WebP, JPEG 2000, BMP, GIF or PNM")
 
 
 def read_query_string(text: str) -> dict[str, Any]:

@@ -29,6 +29,13 @@ def test_what_may_refer_to_other_files_is_refused(head):
     assert refused.value.status_code == 415
 
 
+@pytest.mark.parametrize("head", [b"\0\0\0\x18ftypheic", b"\0\0\0\x1cftypavif", b"\0\0\0\x20ftypisom"])
+def test_pictures_of_phones_and_videos_are_named(head):
+    with pytest.raises(HTTPException) as refused:
+        ending_of(head)
+    assert "in HEIC or AVIF, or a video, which are not read: save a picture as JPEG" in refused.value.detail
+
+
 def test_hints_come_from_the_url():
     found = read_query_string(
         "near=-71.06,42.36,5000&within=-73,41,-70,43&gsd=0.3,0.6&maxTilt=20&focal=900&northUp=true&timeLimit=3"

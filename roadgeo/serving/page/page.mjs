@@ -124,7 +124,7 @@ function update(entry, change) {
   const before = entry.status;
   Object.assign(entry, change);
   if (entry.status !== before && entry.status !== "running") {
-    $("said").textContent = `${entry.name}: ${WORDS[entry.status]}. ${entry.message}`;
+    $("said").textContent = `${entry.name}: ${WORDS[entry.status]}. ${inFields(entry.message)}`;
     if (entry === current) show(entry);
   } else if (entry === current) {
     showProgress(entry);
@@ -191,7 +191,8 @@ function show(entry) {
   }
   const refused = hasMap && status === "not_located" && found?.alternatives.length > 0;
   $("places").hidden = !refused && (status !== "ambiguous" || !placed);
-  $("places").querySelector("p").textContent = refused ? "None is sure enough. If you know one to be right, take it:" : "Which one is it?";
+  const wrong = found?.reason_code === "fits_elsewhere" ? "The first lies outside what you told. If that was wrong, take it:" : "None is sure enough. If you know one to be right, take it:";
+  $("places").querySelector("p").textContent = refused ? wrong : "Which one is it?";
   if (sure) showFiles(entry);
 }
 
@@ -261,6 +262,7 @@ function facts(found, matches) {
   }
   if (found.stated_offset_m !== null) rows.push(["By its own word", `the middle is ${length(found.stated_offset_m)} from here`]);
   if (found.reference) rows.push(["Map", found.reference]);
+  if (found.part_read) rows.push(["Read", found.part_read]);
   return rows;
 }
 
