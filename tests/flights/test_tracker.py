@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from roadgeo.evaluation.landscape import Landscape
 from roadgeo.flights.mavlink import fix_of
 from roadgeo.flights.pose import start
 from roadgeo.flights.rows import make_rows
-from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, follow, latest
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, _falls, follow, latest
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
 
@@ -132,6 +133,26 @@ def test_a_frame_is_not_followed_to_a_block_beside_its_place(blocks):
             or np.hypot(*(state.pose.center - view.homography(frame.frame.center))) < 5.0 * state.pose.sigma_m
         )
     assert np.mean(placed) > 0.8
+
+
+@pytest.mark.parametrize(("beside", "status"), [(0.4, "tracked"), (0.7, "predicted")])
+def test_a_frame_is_doubted_where_a_block_beside_explains_more_by_half_a_power_of_ten(
+    flight, monkeypatch, beside, status
+):
+    flown, (first, frame, *_), reference = flight
+    pose = start(flown.views[0].homography(first.frame.corners), first.frame, 2.0 * np.eye(8))
+    tracker = Tracker([reference])
+    tracker._pose, tracker._reference = pose, reference
+    tracker._agreed = [Tracked(first, "tracked", "", 0, pose, reference, 9.0, 0.9)]
+    monkeypatch.setattr("roadgeo.flights.tracker._compare", lambda *_: (9.0, 0.9, beside))
+    monkeypatch.setattr(tracker, "_search_around", lambda *_: None)
+    assert [state.status for state in tracker.feed(frame)] == [status]
+
+
+@pytest.mark.parametrize(("odds", "agreeing", "falls"), [(4.5, 0.62, True), (4.5, 0.7, False), (5.5, 0.62, False)])
+def test_a_frame_agrees_less_by_half_of_the_odds_and_15_hundredths_of_its_roads(odds, agreeing, falls):
+    before, frame = (SimpleNamespace(log10_odds=of, agreeing=share) for of, share in ((10.0, 0.8), (odds, agreeing)))
+    assert _falls(frame, [before]) is falls
 
 
 def test_a_frame_that_the_mosaic_bends_away_is_placed_from_its_neighbour(flight, monkeypatch):

@@ -10,9 +10,11 @@ from worlds.lattices import contest
 from worlds.scenes import Sight, camera, estimator_of, look, scene_of
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching import rivals, verdict
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.matching import checking, rivals, verdict
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence, _anyhow, _log_ratios, statement_px, tolerance_m
+from roadgeo.matching.hints import read_hint
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.picture import Picture
 from roadgeo.matching.place import Place
@@ -168,6 +170,35 @@ def test_the_picture_counts_a_statement_each_250_m_and_no_likelihood_beyond_10(v
     assert [Picture(soft, view.index, gsd_m).statement_px for gsd_m in (1.0, 10.0)] == [250.0, 50.0]
     assert Picture.lead(8.0, 3.0) == pytest.approx(5.0)
     assert Picture.lead(20.0, 15.0) == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(("score", "is_compared"), [(1.5, False), (3.0, True)])
+def test_a_place_that_leads_those_met_by_2_is_compared_with_places_nearby(view, monkeypatch, score, is_compared):
+    estimator, asked = estimator_of(view.scene, view.index), []
+    monkeypatch.setattr(estimator, "_scored", lambda place: place)
+    monkeypatch.setattr(estimator, "nearby", asked.append)
+    estimator._weigh(SimpleNamespace(score=score))
+    assert bool(asked) is is_compared
+
+
+# --- hints, and places that are given ---------------------------------------------------------------------------------
+
+
+def test_a_heading_may_be_off_by_10_degrees_and_a_single_scale_by_a_quarter():
+    assert read_hint("heading", "90") == ("heading_deg", (90.0, 10.0))
+    assert read_hint("gsd", "0.3") == ("gsd_m", pytest.approx((0.24, 0.375)))
+
+
+@pytest.mark.parametrize(("significance", "found"), [(15.0, "unknown"), (22.0, "off")])
+def test_a_place_is_off_where_chance_moves_one_in_1000_so_far(lattice, monkeypatch, significance, found):
+    truth, index, evidence = lattice
+    offset = SimpleNamespace(over=lambda _: 20.0, sigma_over=lambda _: 1.0, significance=significance)
+    monkeypatch.setattr(checking, "_displacement", lambda *_: offset)
+    location = SimpleNamespace(
+        located=True, places=[SimpleNamespace(matrix=truth @ PIXEL_TO_PLANE, score=9.0, rival=None)]
+    )
+    given = Place(evidence.scene, index, truth)
+    assert checking._judge(location, given, checking.CheckOptions()).verdict == found
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Refinement on made-up towns with known homographies."""
 
+import math
+
 import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
@@ -92,7 +94,19 @@ def test_a_floor_under_every_claim(town, monkeypatch):
     truth, scene = sight_of(town[0], 7)
     matched = Place(scene, town[1], truth).matched
     monkeypatch.setattr(refinement, "_SIGMA_FLOOR", (3.0, 0.15))
-    assert (refine(truth, scene, town[1], matched).corner_sigma_m >= 3.0).all()
+    assert refine(truth, scene, town[1], matched).corner_sigma_m == pytest.approx(np.full(4, 3.0), rel=0.05)
+
+
+def test_errors_of_a_bent_mask_keep_their_sign_further(town, monkeypatch):
+    """Claims grow by the square of what the rms is more than usual."""
+    truth, scene = sight_of(town[0], 7)
+    matched, claims = Place(scene, town[1], truth).matched, []
+    rms = refine(truth, scene, town[1], matched).rms_m / math.hypot(1.2, 0.9)  # pixels of 1 m
+    monkeypatch.setattr(refinement, "_SIGMA_FLOOR", (0.0, 0.0))
+    for more in (0.5, 1.0, 2.0):
+        monkeypatch.setattr(refinement, "_USUAL_RMS", rms / more)
+        claims.append(refine(truth, scene, town[1], matched).corner_sigma_m.mean())
+    assert np.array(claims) / claims[0] == pytest.approx([1.0, 1.0, 2.0], rel=0.05)
 
 
 def test_nothing_to_stand_on_is_no_refinement(town):

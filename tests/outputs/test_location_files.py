@@ -172,6 +172,13 @@ def test_nothing_georeferenced_stays_for_a_mask_that_was_not_located(tmp_path: P
     assert json.loads(paths.json.read_text())["status"] == status
 
 
+def test_whoever_sees_the_json_finds_the_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names, rename = [], Path.replace
+    monkeypatch.setattr(Path, "replace", lambda staged, target: (names.append(target.name), rename(staged, target)))
+    _, paths, *_ = write_location(located(), road_mask(), output_paths(tmp_path, "a"))
+    assert (len(names), names[-1]) == (len(paths), "a_location.json")
+
+
 def test_all_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OutputError("disk full")

@@ -49,7 +49,9 @@ def test_a_mask_without_intersections(tmp_path: Path, mask: RoadMask) -> None:
     empty = RoadGraph.from_polylines(np.empty((0, 2)), np.empty((0, 2), np.int32), [])
     package, picture = write_vectorized(tmp_path, "none", mask, empty, find_intersections(empty))
     assert read_layer(package, "roads")[0] == []
-    assert picture.exists()
+    number = picture.stat().st_ino
+    write_vectorized(tmp_path, "none", mask, empty, find_intersections(empty))
+    assert picture.stat().st_ino != number  # it took the other's place, whole
 
 
 def test_a_large_mask_is_drawn_reduced(mask: RoadMask, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,7 +122,9 @@ MANIFEST = Manifest("m", "00ff", "EPSG:4326", 3000.0, {"attribution": "x"}, (ENT
 @pytest.mark.parametrize("coarse", [None, replace(ENTRY, name="coarse"), replace(ENTRY, name="coarse", crs="")])
 def test_a_manifest_is_read_as_it_was_written(tmp_path, coarse):
     manifest = replace(MANIFEST, coarse=coarse)
+    number = write_manifest(tmp_path, MANIFEST).stat().st_ino
     path = write_manifest(tmp_path, manifest)
+    assert path.stat().st_ino != number  # it took the other's place, whole
     assert read_manifest(path) == manifest
     reference = open_shards(path)
     assert [part.entry.name for part in reference.parts] == ["coarse", "0_0_1x1"][0 if coarse and coarse.crs else 1 :]

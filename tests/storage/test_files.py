@@ -205,6 +205,18 @@ def test_errors_name_the_file_not_where_it_was_staged(tmp_path: Path) -> None:
     assert str(raised.value) == f"cannot write {tmp_path / 'a.json'}: no room"
 
 
+def test_a_process_that_ends_takes_its_temporary_folder_along(tmp_path: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from roadgeo.storage.files import make_temporary_folder
+print(make_temporary_folder(Path(sys.argv[1])).is_dir())
+"""
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=True, capture_output=True, text=True)
+    assert done.stdout == "True\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 def test_a_process_that_is_forked_off_removes_nothing_of_its_parents(tmp_path: Path) -> None:
     program = """
