@@ -128,7 +128,8 @@ class Evidence:
     def compared_with(self, matrix: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
         """Return a function of another place that returns its log10 L, and the lead of this place over it (log10).
 
-        The lead is measured piece by piece. Every other place is compared with the deviation and the share of false
+        The lead is measured piece by piece, and is no more than what this place explains in all: two places that are
+        equal may differ by little everywhere. Every other place is compared with the deviation and the share of false
         roads that explain this place best, and by the query's roads alone: the best of many wrong places lies where the
         map shows few roads that the query lacks, and all other places show more of them in every piece.
         """
@@ -140,7 +141,9 @@ class Evidence:
 
         def compare(other: FloatArray) -> tuple[float, float]:
             there, mapped = self._count(other, self._piece_px, self._shape)
-            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), log10_lead((traced - there) @ ratios)
+            more = (traced - there) @ ratios
+            explained = float(more.sum()) / self.statement_px / math.log(10.0)
+            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), min(log10_lead(more), max(explained, 0.0))
 
         return compare
 
