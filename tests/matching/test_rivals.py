@@ -17,7 +17,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
-from roadgeo.matching.shifts import Shift, move_about
+from roadgeo.matching.shifts import Shift, move_about, shifted
 from roadgeo.matching.triples import larger
 
 NEEDED = LocateOptions().min_log10_odds
@@ -160,6 +160,16 @@ def test_similar_places_point_where_the_image_may(broken):
     assert n_turned(anywhere) > 0
     assert n_turned(there) == 0
     assert len(there) >= len(anywhere) - n_turned(anywhere)
+
+
+def test_places_that_differ_by_little_everywhere_are_equal(broken):
+    truth, _, evidence = broken
+    compare, whole = evidence.compared_with(truth), evidence.weigh(truth)
+    for away_m in (0.3, 0.6, 1.0):
+        there, lead = compare(shifted(truth, away_m, 0.0))
+        assert lead <= 1.5 * max(whole - there, 0.1), away_m
+    there, lead = compare(shifted(truth, 60.0, 0.0))
+    assert 3.0 < lead < whole - there
 
 
 # --- how far the best of many leads by chance -------------------------------------------------------------------------
