@@ -128,14 +128,16 @@ class Evidence:
     def compared_with(self, matrix: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
         """Return a function of another place that returns its log10 L, and the lead of this place over it (log10).
 
-        The lead is measured piece by piece, and is no more than what this place explains in all: two places that are
-        equal may differ by little everywhere. Every other place is compared with the deviation and the share of false
-        roads that explain this place best, and by the query's roads alone: the best of many wrong places lies where the
-        map shows few roads that the query lacks, and all other places show more of them in every piece.
+        The lead is measured piece by piece, and is no more than what this place explains beyond the other, by the
+        query's roads or by all: two places that are equal may differ by little everywhere. Every other place is
+        compared with the deviation and the share of false roads that explain this place best, and by the query's roads
+        alone: the best of many wrong places lies where the map shows few roads that the query lacks, and all other
+        places show more of them in every piece.
         """
         traced, mapped = self._count(matrix, self._piece_px, self._shape)
         of_query, of_map = self._ratios(mapped)
-        nats = self._nats(of_query, of_map, traced.sum(axis=0), mapped.sum(axis=0))
+        both = traced.sum(axis=0), mapped.sum(axis=0)
+        nats, whole = self._nats(of_query, of_map, *both), self._log10(*both)
         sigma, _, false = np.unravel_index(int(nats.argmax()), nats.shape)
         ratios = of_query[sigma, false]
 
@@ -143,7 +145,8 @@ class Evidence:
             there, mapped = self._count(other, self._piece_px, self._shape)
             more = (traced - there) @ ratios
             explained = float(more.sum()) / self.statement_px / math.log(10.0)
-            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), min(log10_lead(more), max(explained, 0.0))
+            likelihood = self._log10(there.sum(axis=0), mapped.sum(axis=0))
+            return likelihood, min(log10_lead(more), max(explained, whole - likelihood, 0.0))
 
         return compare
 
