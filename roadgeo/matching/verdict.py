@@ -254,10 +254,11 @@ def _refuse(
 def _fits_elsewhere(location: Location, listed: Sequence[Place], options: LocateOptions) -> Location:
     """Refuse what hints led to: the first of the places, which they exclude, explains more."""
     better, *hinted = listed
+    lon, lat, radius_m = options.near or (*better.lonlat, 0.0)
     if hinted and hinted[0].score >= options.min_log10_odds:
         where = f"{away(better.apart_m(hinted[0]))} away"
-    elif options.near is not None:
-        where = f"{away(metres_apart(better.lonlat, np.array(options.near[:2])))} away"
+    elif (off_m := metres_apart(better.lonlat, np.array([lon, lat]))) > radius_m:
+        where = f"{away(off_m)} away"
     else:
         where = f"on {better.index.name}"
     ways = broken_hints(better, options)

@@ -81,6 +81,7 @@ def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_
         (1.0, 450.0, "(449|450) m away"),  # from the middle of the circle
         (9.0, None, "(299|300) m away"),
         (1.0, None, "on town 21"),
+        (1.0, 0.0, "on town 21"),  # within the circle: another hint is false
     ],
 )
 def test_a_refusal_says_how_far_away_the_roads_fit_better(town, score, near_m, where):
