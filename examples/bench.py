@@ -10,7 +10,7 @@ that was stopped goes on where it was. Each checkout builds its own references a
 (ROADGEO_DATA); without it from the small ones in tests/data/accept. `--cities` takes files of your own roads as well.
 
 The table has a row for each kind of mask that has a place (`KINDS`), and one for each of masks that have none:
-turned over, as no camera sees the ground, and of the next city. Where two checkouts are compared, each cell holds this
+mirrored, as no camera sees the ground, and of the next city. Where two checkouts are compared, each cell holds this
 one, then the other. "recall" counts places within 20 m or 2 % of the frame's side; "wrong" all others that were
 reported. Corners: of right places, root mean square of the four, metres, median / 90 %. Error / claim: the same over
 `corner_sigma_m`, median / root mean square; 1 is honest. Seconds are processor time, median / mean.
@@ -77,7 +77,7 @@ KINDS = {
     "stale40": Kind(_LOST, {"outdated": (0.4, 0.4)}),
     "void_half": Kind({}, {}, half_black=True),
 }
-#: Kinds that are also turned over, and looked for in the next city.
+#: Kinds that are also mirrored, and looked for in the next city.
 NEGATIVE = ("base", "few8_12", "frame512", "gone50")
 ABSENT = ("turned over", "elsewhere")
 

@@ -58,7 +58,7 @@ NAMES = {
     "stale40": "40 % of the streets unknown to the map",
     "void_half": "half of the frame black",
     "all": "all of them",
-    "turned over": "turned over: no place",
+    "turned over": "mirrored: no place",
     "elsewhere": "of another city: no place",
 }
 

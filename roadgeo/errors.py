@@ -174,8 +174,8 @@ def how_to_install(name: str) -> str:
         asked = requires("roadgeo") or []
     except PackageNotFoundError:  # run from its source
         asked = []
-    found = (re.fullmatch(r"([\w.-]+(?:\[[\w,-]+\])?)[^;]*;\s*extra == ['\"]([\w-]+)['\"]", query) for query in asked)
-    brought = " ".join(_quoted(result[1]) for result in found if result and result[2] == name)
+    matches = (re.fullmatch(r"([\w.-]+(?:\[[\w,-]+\])?)[^;]*;\s*extra == ['\"]([\w-]+)['\"]", query) for query in asked)
+    brought = " ".join(_quoted(match[1]) for match in matches if match and match[2] == name)
     packages = brought or (name if name in _BRINGS else f"'roadgeo[{name}]'")
     parts = Path(sys.prefix).parts
     if "pipx" in parts:

@@ -52,15 +52,15 @@ def load_plugin(group: str, name: str) -> Any:
     PluginError
         No plugin has that name, or it cannot be imported.
     """
-    found = find_plugins(group)
-    if name not in found:
+    plugins = find_plugins(group)
+    if name not in plugins:
         raise PluginError(
-            f"no {name!r} among the {group}, expected one of {', '.join(sorted(found))}; is it installed?"
+            f"no {name!r} among the {group}, expected one of {', '.join(sorted(plugins))}; is it installed?"
         )
     try:
-        return found[name].load()
+        return plugins[name].load()
     except Exception as error:
-        raise PluginError(f"{_describe(found[name])} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{_describe(plugins[name])} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
 def call_plugin(group: str, name: str, *arguments: Any, **options: Any) -> Any:

@@ -4,7 +4,7 @@
     python examples/company/company.py shards         masks of five cities, on the atlas in shards
     python examples/company/company.py told           frames with a circle of 40 m on the wrong blocks, and on the right
     python examples/company/company.py twice          maps that hold a district twice
-    python examples/company/company.py mirrored       soft masks of grids, turned over: they have no place
+    python examples/company/company.py mirrored       soft masks of grids, mirrored: they have no place
     python examples/company/company.py table          count the results again
 
 Every search is a row in results/NAME.csv; a run that was stopped goes on where it was. Maps are built once, in --maps.

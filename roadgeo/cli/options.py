@@ -1,4 +1,4 @@
-"""Options of the commands: their types, those that several commands share, and how their help is laid out."""
+"""Options of the commands: their types, those that several commands share, and the layout of their help."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Queries:
     road_width: tuple[float, float] = option("--road-width", "LO:HI", OTHERS,
         "Width of a street, metres.", read=read_range, default="8:11", show_default=True, rare=True)
     mirrored: int = option("--mirrored", "N", OTHERS,
-        "Draw so many masks turned over besides, which have no place and must be refused.",
+        "Draw so many mirrored masks besides, which have no place and must be refused.",
         limits=(0, None), default=0, rare=True)
     seed: int = option("--seed", "N", OTHERS,
         "Other seeds draw other masks.", limits=(0, None), default=0, show_default=True, rare=True)

@@ -36,7 +36,7 @@ FLIGHT = "The flight"
 _HELP = """Follow a flight over the map, frame by frame.
 
 FRAMES overlap, each with the one before: masks or photographs (files, folders or patterns, in order), or a video. One
-low frame shows too few roads to be located; so frames are laid together until the map knows them, and from there on
+low frame shows too few roads to be located; so frames are stitched until the map knows them, and from there on
 each is followed from the one before:
 
 \b
@@ -68,7 +68,7 @@ How a frame moved is told by the photographs, or roughly by the masks alone; bes
 knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by row, the homography that takes a pixel
 (column, row) of the frame to the pixel of the frame before that shows the same ground. The first frame needs none.
 
-Frames of an archive are in no order: with --unordered each is laid on each other, by what the pictures show or by the
+Frames of an archive are in no order: with --unordered each pair is registered, by what the pictures show or by the
 roads of the masks; what overlaps is solved together, located together, and each frame is placed.
 
 With --focal the place of the camera is computed, too, which is not the ground in the frame's middle. That is what an

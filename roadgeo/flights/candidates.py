@@ -35,7 +35,7 @@ MOST = 60
 
 @dataclass(frozen=True)
 class MosaicQuery:
-    """Frames laid together, and which they are.
+    """Stitched frames, and which they are.
 
     Attributes
     ----------

@@ -237,8 +237,8 @@ def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[f
 def _named_times(paths: Sequence[str]) -> list[float]:
     """Return the times in the names of images, seconds: dates, or the only number; none where not all have one."""
     for pattern in _TIMES:
-        found = [pattern.search(Path(path).stem) for path in paths]
-        read = [_time_of(*match.groups()) for match in found if match is not None]
+        matches = [pattern.search(Path(path).stem) for path in paths]
+        read = [_time_of(*match.groups()) for match in matches if match is not None]
         times = [time for time in read if time is not None]
         if len(times) == len(paths) and len({*times}) > 1:
             return times

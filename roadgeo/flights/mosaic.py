@@ -1,4 +1,4 @@
-"""Frames of a flight laid together on one plane: a larger query than any of them.
+"""Frames of a flight stitched on one plane: a larger query than any of them.
 
 Frames are chained by the homographies between neighbours. On the plane of a tilted frame a flight shrinks towards the
 horizon; so the plane is levelled: turned until all frames show about as much ground, as they do from one height.
@@ -18,7 +18,7 @@ from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.vectorization import road_width
 
-__all__ = ["Mosaic", "chain", "lay_down", "lay_together", "level", "road_px"]
+__all__ = ["Mosaic", "chain", "draw_mosaic", "level", "road_px", "stitch"]
 
 
 #: Roads are drawn about so wide, so that large frames do not make a larger mosaic than tracing needs.
@@ -90,7 +90,7 @@ def road_px(masks: Sequence[RoadMask]) -> float:
     return float(np.median(shown)) if shown else 1.0
 
 
-def lay_together(masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float) -> Mosaic | None:
+def stitch(masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float) -> Mosaic | None:
     """Lay frames of one size on one plane; None where no camera above a plane moves so.
 
     Parameters
@@ -100,10 +100,10 @@ def lay_together(masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_p
     road_px : float
         Width of a road in the frames.
     """
-    return lay_down(masks, chain(motion), road_px)
+    return draw_mosaic(masks, chain(motion), road_px)
 
 
-def lay_down(masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float) -> Mosaic | None:
+def draw_mosaic(masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float) -> Mosaic | None:
     """Lay frames of one size, whose pixels (K, 3, 3) `to_plane` takes to one plane, on it, levelled; see above."""
     height, width = masks[0].shape
     frame = Frame(width, height)

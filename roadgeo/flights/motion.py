@@ -45,7 +45,7 @@ _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
 _BUCKET_PX = 32.0
 #: The least share of road points in the overlap that must lie on roads of the other mask.
 _LEAST_SHARE = 0.6
-#: Frames in no order are laid on each other where they share this part: less agrees by chance.
+#: Frames in no order are registered where they share this part: less agrees by chance.
 _LEAST_SHARED = 0.3
 #: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before,
 #: and the score of a motion that differs is reduced by this much, per frame's side; unless a jump fits clearly better.
@@ -162,7 +162,7 @@ class Odometer:
 
 
 class _Alignment(NamedTuple):
-    """A mask laid on another: how, the shares of either's roads that agree, and of the frame that both see.
+    """A mask registered to another: how, the shares of either's roads that agree, and of the frame that both see.
 
     Where frames share less, less can disagree: the quality is the agreement, times the root of the shared part.
     """
@@ -243,7 +243,7 @@ def _lay(guess: FloatArray, frame: Frame, first: TracedMask, other: TracedMask) 
 
 @dataclass(frozen=True)
 class TracedMask:
-    """A mask, traced, that is laid on many others."""
+    """A mask, traced, that is registered to many others."""
 
     mask: RoadMask
     scene: Scene
@@ -260,7 +260,7 @@ class TracedMask:
 
 
 def overlay(first: TracedMask, other: TracedMask) -> list[tuple[FloatArray, float]]:
-    """Lay a mask on another that was taken anywhere near, either way up, where their roads agree.
+    """Register a mask to another that was taken anywhere near, either way up, where their roads agree.
 
     Where streets are alike there may be two such places, a block apart; none means that they do not overlap.
 

@@ -1,8 +1,8 @@
 """Strips of an archive: frames that overlap, in no order, are solved together and placed together.
 
-Each pair of frames is laid on each other, by features of their pictures or by their roads. The resulting links make
+Each pair of frames is registered, by features of their pictures or by their roads. The resulting links make
 one or more nets; in each, all frames are adjusted at once, so that every link agrees with the others, and the mosaic of
-all is located like one mask. There each frame is laid on the roads of the map by itself.
+all is located like one mask. There each frame is fitted to the roads of the map by itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo.flights.mosaic import lay_down, road_px
+from roadgeo.flights.mosaic import draw_mosaic, road_px
 from roadgeo.flights.motion import TracedMask, between_images, overlay
 from roadgeo.flights.tracker import AROUND, FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.geometry.frame import Frame
@@ -109,7 +109,7 @@ class _Net:
         masks = [frame.mask for frame in frames]
         if not any(mask.roads.any() for mask in masks):
             return [], "no roads are seen"
-        mosaic = lay_down(masks, self.matrices[list(chosen)], road_px(masks))
+        mosaic = draw_mosaic(masks, self.matrices[list(chosen)], road_px(masks))
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
         options = tracker.search_options(mosaic, masks)

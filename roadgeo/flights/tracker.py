@@ -1,7 +1,7 @@
-"""The way of a flight: frames are laid together until the map knows them, then each is followed from the one before.
+"""The way of a flight: frames are stitched until the map knows them, then each is followed from the one before.
 
-While nothing is known, each frame is laid to those before, and the mosaic is located like any mask: the evidence is
-the engine's, and each further look takes its share off. From there on a frame is predicted by its motion, laid on
+While nothing is known, each frame is stitched to those before, and the mosaic is located like any mask: the evidence is
+the engine's, and each further look takes its share off. From there on a frame is predicted by its motion, fitted to
 the roads nearby, and compared with places nearby, and with how the frames before agreed. A frame that agrees less is
 searched for a frame's width around. Frames that do not agree are taken for predicted; where several in a row do not,
 the flight is lost, and the search begins anew with them.
@@ -19,7 +19,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, MosaicQuery
-from roadgeo.flights.mosaic import Mosaic, lay_together, road_px
+from roadgeo.flights.mosaic import Mosaic, road_px, stitch
 from roadgeo.flights.pose import FilterOptions, FramePose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.frame import Frame
@@ -37,7 +37,7 @@ __all__ = ["AROUND", "Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Track
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
-#: The latest of the frames that wait for a place are laid together, up to this number.
+#: The latest of the frames that wait for a place are stitched, up to this number.
 _MOST_FRAMES = 32
 #: A mosaic is located once it shows the first number of intersections, and again after the second number of more
 #: intersections, or the third of more frames.
@@ -267,8 +267,8 @@ class Tracker:
         if checked.verdict == "unknown" or checked.placement is None:
             return None
         corners = Homography(checked.placement.matrix)(frame.corners)
-        found = self._judge(waiting, self._started(corners, frame), known_at, "located")
-        return found if found.status == "located" and not _falls(found, agreed) else None
+        tracked = self._judge(waiting, self._started(corners, frame), known_at, "located")
+        return tracked if tracked.status == "located" and not _falls(tracked, agreed) else None
 
     def _started(self, corners: FloatArray, frame: Frame) -> FramePose:
         """Return the pose of a frame whose corners (4, 2) a search has located."""
@@ -292,14 +292,14 @@ class Tracker:
     # --- searching ----------------------------------------------------------------------------------------------------
 
     def _search(self, waiting: _Waiting) -> list[Tracked]:
-        """Lay the next frame to those that wait, and look for all of them where that is worth while."""
+        """Stitch the next frame to those that wait, and look for all of them where that may help."""
         frame = waiting.frame
         if frame.motion is None or (self._window and self._window[-1].frame.frame != frame.frame):
             self._window = []
             self._forget()
         self._window = [*self._window, waiting][-_MOST_FRAMES:]
         masks = [member.frame.mask for member in self._window]
-        mosaic = lay_together(masks, [_motion(member) for member in self._window], road_px(masks))
+        mosaic = stitch(masks, [_motion(member) for member in self._window], road_px(masks))
         if mosaic is None:
             self._window = [waiting]
             self._forget()

@@ -78,7 +78,7 @@ class RoadMask:
         return f"<RoadMask {self.name!r}: {width} x {height} pixels, {self.roads.mean():.1%} road>"
 
     def mirrored(self) -> RoadMask:
-        """Return it turned over, left to right."""
+        """Return it mirrored, left to right."""
         more = (self.observed, self.probability)
         observed, probability = (None if array is None else array[:, ::-1].copy() for array in more)
         return replace(self, roads=self.roads[:, ::-1].copy(), observed=observed, probability=probability)

@@ -124,7 +124,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """An image laid on the ground; equal to itself only.
+    """An image placed on the ground; equal to itself only.
 
     Attributes
     ----------

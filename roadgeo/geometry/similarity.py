@@ -26,14 +26,14 @@ _MOST = 13.28
 class Similarity(NamedTuple):
     """A similarity as a homography (3, 3), and the covariance (8, 8) of where it puts the corners.
 
-    `doubt` (8, 8) is added to that where the camera may not have looked straight down: the parameters set aside
+    `by_tilt` (8, 8) is added to that where the camera may not have looked straight down: the parameters set aside
     counts as an error, weighed by the share of level views of which less has to be. Among 958 frames tilted by up to 60
     degrees five were taken for level, and without it were off by two to ten times what was claimed.
     """
 
     matrix: FloatArray
     corner_covariance: FloatArray
-    doubt: FloatArray
+    by_tilt: FloatArray
 
 
 def find_similarity(homography: FloatArray, corners: FloatArray, corner_covariance: FloatArray) -> Similarity | None:

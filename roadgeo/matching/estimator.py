@@ -231,8 +231,8 @@ class TripleEstimator:
         settled = self._settled.get(other)
         return settled is not None and settled.log10_likelihood >= _LEAST_LIKELY and settled.same(place)
 
-    def known_places(self) -> list[Place]:
-        """Return the verified places that fit."""
+    def whole_places(self) -> list[Place]:
+        """Return the verified places that fit the whole frame."""
         return self._whole
 
     def enough(self) -> bool:
@@ -399,12 +399,12 @@ class TripleEstimator:
             fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or fault is not None or self._is_far(refined.matrix):
                 return (place, True) if best >= 0.0 else (place.but(fault=fault, score=-math.inf), False)
-            laid = place.at(refined)
-            agreeing = laid.agreement.forward
+            fit = place.at(refined)
+            agreeing = fit.agreement.forward
             if agreeing < best:
                 break
-            place = laid
-            if agreeing <= max(before, best) + 0.01 or laid.log10_likelihood < least:
+            place = fit
+            if agreeing <= max(before, best) + 0.01 or fit.log10_likelihood < least:
                 break
             best = agreeing
         return place, True

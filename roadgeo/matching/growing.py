@@ -120,7 +120,7 @@ class Member(Protocol):
     def enough(self) -> bool:
         """Return whether enough places were screened."""
 
-    def known_places(self) -> Sequence[Place]:
+    def whole_places(self) -> Sequence[Place]:
         """Return the places that fit the whole frame."""
 
 
@@ -226,7 +226,7 @@ class SharedSweeps:
 
     def _is_met(self, place: Place, best: Sequence[tuple[Member, Place]]) -> bool:
         """Return whether another shard that overlaps this one has the same place."""
-        met = [*(other for _, other in best), *(other for member in self.members for other in member.known_places())]
+        met = [*(other for _, other in best), *(other for member in self.members for other in member.whole_places())]
         beside = (other for other in met if other.index is not place.index and other.index.is_shard_beside(place.index))
         return any(other.same(place) for other in beside)
 

@@ -26,7 +26,7 @@ from roadgeo.matching.paper import PairOptions, match_pairs
 from roadgeo.matching.parts import Part, Whole
 from roadgeo.matching.picture import by_picture
 from roadgeo.matching.place import Place, Weight
-from roadgeo.matching.rivals import N_KNOWN, Rivals
+from roadgeo.matching.rivals import N_LIKELIEST, Rivals
 from roadgeo.matching.road_search import COARSE_PIXEL_M, make_raster
 from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Ahead, Search, search_together
@@ -282,7 +282,7 @@ def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], riv
     return replace(
         begun,
         places=() if best is None or best.refined is None else _listed(estimator, best, rivals.needed),
-        likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]),
+        likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]),
         stopped=search.stopped,
         n_tried=estimator.n_screened,
         n_anchors=estimator.n_anchors,
@@ -372,8 +372,8 @@ def _search_pairs_in_turn(
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> Searched:
     """Run the paper's method; its places have no scores."""
     scene, table = query.scene, paired(index, options.tuples)
-    found = query.intersections_by(options.n_px) if options.from_center else scene.intersections
-    match = match_pairs(found, table, scene.corners, options)
+    intersections = query.intersections_by(options.n_px) if options.from_center else scene.intersections
+    match = match_pairs(intersections, table, scene.corners, options)
     searched = Searched(
         index,
         stopped=match.stopped,
@@ -385,6 +385,6 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> 
     if match.homography is None:
         return searched
     matched = np.full(len(scene.intersections), -1, np.int64)
-    rows = np.searchsorted(scene.intersections.node, found.node[match.matches[:, 0]])
+    rows = np.searchsorted(scene.intersections.node, intersections.node[match.matches[:, 0]])
     matched[rows] = table.reference.node[match.matches[:, 1]]
     return replace(searched, places=(Place(scene, index, match.homography, grown=matched, score=math.nan),))

@@ -31,7 +31,7 @@ class Weight(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A scene laid on a map by a homography; equal to itself only. Dimension: N intersections of the scene.
+    """A scene placed on a map by a homography; equal to itself only. Dimension: N intersections of the scene.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["N_KNOWN", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
+__all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -48,17 +48,17 @@ _MOST_TURNS = 12
 #: A place is not compared further if it leads all places nearby by the first score, is contradicted by less than the
 #: second, and the best place nearby explains less than this part of it: streets do not repeat there. Four of 274
 #: mirrored masks led by the first, where a city is like its mirror image: they were contradicted by 8.7 and more.
-_CERTAIN, _DOUBTED, _REPEATING = 12.0, 1.0, 0.5
+_CERTAIN, _CONTRADICTED, _REPEATING = 12.0, 1.0, 0.5
 #: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
 #: that part is up to a tenth, at right places nine tenths and more.
 _MAY_LEAD = 0.5
 #: Score that a place loses if all its roads are contradicted, and in proportion (see `Evidence.contradicted`). At right
 #: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
 #: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
-_DOUBT = 60.0
+_PENALTY = 60.0
 #: Number of the likeliest places met by the search that are compared; and number of road points for the rough
 #: refinement of places around.
-N_KNOWN, _N_POINTS = 12, 200
+N_LIKELIEST, _N_POINTS = 12, 200
 #: Number of the likeliest places around that are fully refined.
 _N_FITTED = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
@@ -152,7 +152,7 @@ class Rivals:
 
         A rival that leads by less than the score needed is not located either: it leads the place by no more.
         """
-        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_KNOWN]
+        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]
         gsd_m = ranked[0].gsd_m
         best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
         for _ in range(_MOST_TURNS):
@@ -195,9 +195,9 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[:N_KNOWN], key=lambda place: place.log10_likelihood - _penalty(place))
+        best = max(ranked[:N_LIKELIEST], key=lambda place: place.log10_likelihood - _penalty(place))
         for _ in range(_MOST_TURNS):
-            key = best, *ranked[: 1 + N_KNOWN]
+            key = best, *ranked[: 1 + N_LIKELIEST]
             compared = self._compared.get(key) or self._compare(estimator, best, ranked)
             self._compared[key] = compared
             if not _is_beaten(compared):
@@ -211,10 +211,10 @@ class Rivals:
         gave_up = best.refined is None and not math.isfinite(best.score)
         if gave_up or best.log10_likelihood < self.needed:
             return best.but(rival=None)
-        penalty, worth = _penalty(best), best.log10_likelihood
+        penalty, own = _penalty(best), best.log10_likelihood
         likeliest = next((other.log10_likelihood for other in ranked if not other.same(best)), 0.0)
-        lead = min(best.score, worth - max(likeliest, 0.0))
-        if lead >= _CERTAIN and penalty < _DOUBTED and max(likeliest, estimator.nearby(best)) < _REPEATING * worth:
+        lead = min(best.score, own - max(likeliest, 0.0))
+        if lead >= _CERTAIN and penalty < _CONTRADICTED and max(likeliest, estimator.nearby(best)) < _REPEATING * own:
             return best.but(score=lead - penalty, rival=None)
         if time.perf_counter() > self._deadline:
             return best.but(score=min(lead, 0.0), rival=None)
@@ -225,24 +225,24 @@ class Rivals:
             return bool(
                 math.dist(other.place.center, best.center) > apart_m
                 and estimator.may_be(other.place.matrix)
-                and (other.net > worth or best.evidence.shared(best.matrix, other.place.matrix) < _SAME)
+                and (other.net > own or best.evidence.shared(best.matrix, other.place.matrix) < _SAME)
             )
 
         def scored(others: Sequence[Compared]) -> Place:
             rival = max(others, key=lambda other: other.net, default=None)
             lead = min((other.lead for other in others), default=math.inf)
-            lead += log10_gap(worth, [other.log10_likelihood for other in others])
+            lead += log10_gap(own, [other.log10_likelihood for other in others])
             if rival is None:
-                return best.but(score=min(lead, worth) - against, rival=None)
-            score = worth - rival.net if rival.net > worth else min(lead, worth) - against
+                return best.but(score=min(lead, own) - against, rival=None)
+            score = own - rival.net if rival.net > own else min(lead, own) - against
             return best.but(score=score, rival=rival.place.but(by=Weight(rival.net, best.statement_px)))
 
-        others = [place for place in ranked[: 1 + N_KNOWN] if place is not best]
+        others = [place for place in ranked[: 1 + N_LIKELIEST] if place is not best]
         met = (Compared(place, *compare(place.matrix), _penalty(place)) for place in others)
         rivals = list(filter(is_rival, met))
         compared = scored(rivals)
         leads = compared.score >= _MAY_LEAD * self.needed
-        if not leads and estimator.nearby(best) < _REPEATING * worth:
+        if not leads and estimator.nearby(best) < _REPEATING * own:
             return compared
         for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(best, compare, estimator.options, around))
@@ -254,8 +254,8 @@ class Rivals:
     def _take(self, estimator: TripleEstimator, rival: Place | None, ranked: Sequence[Place]) -> Place:
         """Return the rival that explains more than the likeliest place, as it was verified; now, if it was not yet."""
         matrix = rival.matrix  # type: ignore[union-attr]
-        known = next((place for place in ranked if place.matrix is matrix), None)
-        return known or estimator.settle(Place(estimator.scene, estimator.index, matrix))[0]
+        verified = next((place for place in ranked if place.matrix is matrix), None)
+        return verified or estimator.settle(Place(estimator.scene, estimator.index, matrix))[0]
 
 
 def _is_beaten(place: Place) -> bool:
@@ -270,7 +270,7 @@ def _lead(place: Place, other: Place) -> float:
 
 def _penalty(place: Place) -> float:
     """Return the score that a place loses for the roads that it contradicts."""
-    return _DOUBT * place.contradicted
+    return _PENALTY * place.contradicted
 
 
 def _around(picture: Picture, best: Place, reach_m: float, apart_m: float, estimator: TripleEstimator) -> list[Place]:

@@ -139,13 +139,13 @@ def _ranked(pool: Sequence[Place], needed: float) -> list[Place]:
     return leading + _distinct([place for place in pool if place.score < needed], leading)
 
 
-def _distinct(pool: Sequence[Place], known: Sequence[Place] = ()) -> list[Place]:
-    """Return the places that are not known, the best first, each once; places of one search are different."""
-    distinct = list(known)
+def _distinct(pool: Sequence[Place], listed: Sequence[Place] = ()) -> list[Place]:
+    """Return the places that are not listed yet, the best first, each once; places of one search are different."""
+    distinct = list(listed)
     for place in sorted(pool, key=lambda place: (-place.explained, -place.score)):
         if not any(place.index is not other.index and place.same(other) for other in distinct):
             distinct.append(place)
-    return distinct[len(known) :]
+    return distinct[len(listed) :]
 
 
 def _listed(searched: Sequence[Searched], compared: Sequence[Place]) -> list[Place]:
@@ -321,8 +321,8 @@ def _what_may_help(listed: Sequence[Place], options: LocateOptions) -> str:
     helps = []
     for lacks, name, precision, option, apart, most in hints:
         left = f"{sum(gap <= most for gap in apart)} of {len(listed)} places"
-        known = f"{name} to {precision} {option} would leave {left}" if len(listed) > 1 else f"{name} {option}"
-        helps += [known] * lacks
+        help_ = f"{name} to {precision} {option} would leave {left}" if len(listed) > 1 else f"{name} {option}"
+        helps += [help_] * lacks
     others = ["a search with full effort"] * (options.effort == "quick") + ["more roads in view"]
     if len(listed) > 1 and helps:
         return f"{', '.join(helps)}; {', '.join(others)} or another map may help"
@@ -422,6 +422,6 @@ def _level(place: Place) -> Place:
     if level is None:
         return place
     # The covariance may be too large. Roads that agreed must still agree.
-    refined = replace(place.refined, matrix=level.matrix, corner_covariance_m2=level.corner_covariance + level.doubt)
+    refined = replace(place.refined, matrix=level.matrix, corner_covariance_m2=level.corner_covariance + level.by_tilt)
     levelled = place.at(refined)
     return levelled if levelled.agreement.forward >= place.agreement.forward - _LEAST_LOST else place

@@ -1,4 +1,4 @@
-"""A picture of a frame, and its roads, laid on the map."""
+"""A picture of a frame, and its roads, placed on the map."""
 
 from __future__ import annotations
 

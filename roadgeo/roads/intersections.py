@@ -131,8 +131,8 @@ def find_intersections(graph: RoadGraph, options: IntersectionOptions | None = N
     )
     node = np.flatnonzero(degree >= 3)
     starts = np.concatenate(([0], np.cumsum(degree[node]))).astype(np.int64)
-    found = describe(graph.xy[node], starts, lines, options)
-    return replace(found, node=node).only(np.flatnonzero(found.n_branches >= 3))
+    described = describe(graph.xy[node], starts, lines, options)
+    return replace(described, node=node).only(np.flatnonzero(described.n_branches >= 3))
 
 
 def describe(near: FloatArray, starts: IntArray, lines: FloatArray, options: IntersectionOptions) -> Intersections:

@@ -56,11 +56,11 @@ def trimmed(mask: RoadMask) -> Variant:
     if mask.observed is None or not mask.observed.any():
         return variant
     part = rows, columns = extent(mask.observed)
-    seen = mask.observed[part].copy()
-    if min(seen.shape) < _MIN_SIDE or seen.size == mask.observed.size:
+    observed = mask.observed[part].copy()
+    if min(observed.shape) < _MIN_SIDE or observed.size == mask.observed.size:
         return variant
     probability = None if mask.probability is None else mask.probability[part].copy()
-    shown = RoadMask(mask.roads[part].copy(), None if seen.all() else seen, mask.name, probability)
+    shown = RoadMask(mask.roads[part].copy(), None if observed.all() else observed, mask.name, probability)
     return Variant(shown, shift(-columns.start, -rows.start))
 
 

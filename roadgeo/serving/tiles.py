@@ -35,7 +35,7 @@ _MOST_SHARDS, _MOST_SEGMENTS = 16, 60_000
 _MOST_STREETS = 200_000
 #: A street farther from a place lends it no name, metres of web maps.
 _NAMED_WITHIN_M = 500.0
-#: Steps of a tile's side to which its roads are laid where it shows more than a town.
+#: Steps of a tile's side to which its roads are rounded where it shows more than a town.
 _COARSE = 512
 
 

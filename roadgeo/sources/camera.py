@@ -48,16 +48,16 @@ def read_stated(names: Iterable[str], image: str, photo: str | None = None) -> d
     MaskError
         It does not state one of them.
     """
-    path, found = photo or image, dict[str, Any]()
+    path, read = photo or image, dict[str, Any]()
     for name in names:
         if name == "near":
-            found[name] = _View.of(path).near()
+            read[name] = _View.of(path).near()
         elif name == "heading_deg":
-            found[name] = _View.of(path).heading_deg()
+            read[name] = _View.of(path).heading_deg()
         else:
             focal_px = read_focal_length(path) * max(raster_size(image))
-            found[name] = focal_px if name == "focal_px" else _View.of(path).gsd_m(focal_px)
-    return found
+            read[name] = focal_px if name == "focal_px" else _View.of(path).gsd_m(focal_px)
+    return read
 
 
 def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
@@ -151,7 +151,7 @@ def _slant(tilt_deg: float) -> float:
 def _find(xmp: str, names: Iterable[str]) -> float:
     """Return the number that the first of these names has in XMP, as an attribute or an element; NaN without one."""
     for name in names:
-        found = re.search(rf"\b{name}(?:\s?=\s?[\"']|>)\s?([-+]?\d{{1,9}}(?:\.\d{{1,12}})?)(?:/(\d{{1,9}}))?", xmp)
-        if found:
-            return float(found[1]) / float(found[2] or 1) if float(found[2] or 1) else math.nan
+        match = re.search(rf"\b{name}(?:\s?=\s?[\"']|>)\s?([-+]?\d{{1,9}}(?:\.\d{{1,12}})?)(?:/(\d{{1,9}}))?", xmp)
+        if match:
+            return float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else math.nan
     return math.nan

@@ -222,7 +222,7 @@ def _unpacked(path: Path, folder: Path) -> list[Path]:
     unpacked = unpack(path, folder)
     if unpacked.is_file():
         return [unpacked]
-    geodatabases = [found for found in unpacked.rglob("*.[gG][dD][bB]") if found.is_dir()]
+    geodatabases = [folder for folder in unpacked.rglob("*.[gG][dD][bB]") if folder.is_dir()]
     return geodatabases or _roads_among(path, sorted(file for file in unpacked.rglob("*") if file.is_file()))
 
 

@@ -183,7 +183,7 @@ def tiff_pages(file: BinaryIO, wanted: int) -> Iterator[int]:
 
 
 class _Layout(NamedTuple):
-    """How the directories of a TIFF are laid out."""
+    """The layout of the directories of a TIFF."""
 
     start: int
     order: str

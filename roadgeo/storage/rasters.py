@@ -210,10 +210,10 @@ def writing_raster(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except (RasterioError, CPLE_BaseError, CRSError) as error:
         reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise OutputError(f"cannot write {os.fspath(path)}: {reason}{_doubt(reason, Path(path))}") from error
+        raise OutputError(f"cannot write {os.fspath(path)}: {reason}{_likely_cause(reason, Path(path))}") from error
 
 
-def _doubt(reason: str, path: Path) -> str:
+def _likely_cause(reason: str, path: Path) -> str:
     """Return the likely cause of an error of GDAL's, where there is evidence for one."""
     if "proj.db" in reason:
         return "; PROJ's data are missing: unset PROJ_DATA and PROJ_LIB, or install rasterio again"

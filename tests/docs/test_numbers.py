@@ -68,7 +68,7 @@ FROM_CODE = [
     (SECTION_8, r"and (two thirds) of the roads met there", rivals._SAME),
     (SECTION_8, r"cut into pieces of (\d+) m", evidence._PIECE_M),
     (SECTION_8, r"next `n` places lie, (\d+) at most", rivals._TAIL),
-    (SECTION_8, r"\*\*contradiction\*\*: (\d+) times the share", rivals._DOUBT),
+    (SECTION_8, r"\*\*contradiction\*\*: (\d+) times the share", rivals._PENALTY),
     (SECTION_8, r"less than (a tenth) as much as it does elsewhere", evidence._HARDLY),
     (SECTION_8, r"of `n / ([\d,]+)` intersections", triples._USUAL_SIZE),
     (SECTION_8, r"traced roads is below (\d+), the picture is asked", rivals._CERTAIN),

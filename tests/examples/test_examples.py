@@ -42,7 +42,7 @@ def test_the_tables_of_how_well_are_those_of_the_code(tmp_path: Path) -> None:
     tables = runpy.run_path(str(EXAMPLES / "tables.py"))  # another folder of examples has a module of that name
     lines = list(tables["bench_table"]({"this": {"clean": kind, "turned over": absent}}))
     assert lines[2].endswith("| 7 of 8 | 0 | 0.5 m / 1.2 m | 0.90, 1.10 | 0.1 |")
-    assert lines[3] == "| turned over: no place |  | 0 of 8 |  |  | 0.1 |"
+    assert lines[3] == "| mirrored: no place |  | 0 of 8 |  |  | 0.1 |"
 
 
 def test_the_bench_compares_two_checkouts_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

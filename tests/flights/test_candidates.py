@@ -6,7 +6,7 @@ import shapely
 from shapely import affinity
 
 from roadgeo.flights.candidates import Candidates, MosaicQuery
-from roadgeo.flights.mosaic import lay_together
+from roadgeo.flights.mosaic import stitch
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Reason
@@ -19,7 +19,7 @@ from roadgeo.roads.network import build_network
 
 def mosaic_of(flown, count, searched):
     flight, masks, _ = flown
-    mosaic = lay_together(masks[:count], list(flight.motion[:count]), 8.0)
+    mosaic = stitch(masks[:count], list(flight.motion[:count]), 8.0)
     return MosaicQuery(read_query(mosaic.mask), mosaic, range(count), searched)
 
 

@@ -1,10 +1,10 @@
-"""Frames laid together on one plane."""
+"""Frames stitched on one plane."""
 
 from itertools import pairwise
 
 import numpy as np
 
-from roadgeo.flights.mosaic import ROAD_PX, chain, lay_together, level
+from roadgeo.flights.mosaic import ROAD_PX, chain, level, stitch
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
@@ -43,7 +43,7 @@ def test_roads_that_one_frame_misses_are_taken_from_others():
     broken = roads.copy()
     broken[100:200] = False
     masks = [RoadMask(item) for item in (roads, broken, roads, roads)]
-    mosaic = lay_together(masks, motion, ROAD_PX)
+    mosaic = stitch(masks, motion, ROAD_PX)
     assert mosaic is not None
     for k, matrix in enumerate(mosaic.to_mosaic):
         column, row = np.floor(Homography(matrix)(np.array([160.5, 120.5]))).astype(int)
@@ -54,7 +54,7 @@ def test_roads_that_one_frame_misses_are_taken_from_others():
 
 def test_motion_of_no_camera_is_refused():
     masks = [RoadMask(np.ones((240, 320), bool))] * 2
-    assert lay_together(masks, [np.eye(3), np.diag([-1.0, 1.0, 1.0])], 5.0) is None
+    assert stitch(masks, [np.eye(3), np.diag([-1.0, 1.0, 1.0])], 5.0) is None
 
 
 def test_a_mosaic_is_as_sure_as_its_frames():
@@ -62,11 +62,11 @@ def test_a_mosaic_is_as_sure_as_its_frames():
     roads = np.zeros((240, 320), bool)
     roads[:, 150:170] = True
     frames = [RoadMask(roads, probability=np.where(roads, sure, 30).astype(np.uint8)) for sure in (200, 100, 200, 100)]
-    mosaic = lay_together(frames, motion, ROAD_PX)
+    mosaic = stitch(frames, motion, ROAD_PX)
     assert mosaic is not None
     assert mosaic.mask.probability is not None
     assert mosaic.mask.observed is not None
     column, row = np.floor(Homography(mosaic.to_mosaic[1])(np.array([160.5, 120.5]))).astype(int)
     assert 130 <= mosaic.mask.probability[row, column] <= 170
     assert (mosaic.mask.probability[~mosaic.mask.observed] == PROBABILITY_UNKNOWN).all()
-    assert lay_together([RoadMask(roads)] * 4, motion, 20.0).mask.probability is None
+    assert stitch([RoadMask(roads)] * 4, motion, 20.0).mask.probability is None

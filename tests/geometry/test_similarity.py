@@ -86,7 +86,7 @@ def test_a_tilted_view_that_is_taken_for_level_is_as_unsure_as_it_is_wrong(sigma
         found = find_similarity(through(corners, seen), corners, covariance)
         if found is not None:
             errors.append(np.sum((Homography(found.matrix).everywhere(corners) - true) ** 2))
-            claimed.append(np.trace(found.corner_covariance + found.doubt))
+            claimed.append(np.trace(found.corner_covariance + found.by_tilt))
     assert len(errors) > 20
     assert 0.6 < np.sqrt(np.mean(np.divide(errors, claimed))) < 1.4
 

@@ -46,7 +46,7 @@ class Part:
     def enough(self):
         return False
 
-    def known_places(self):
+    def whole_places(self):
         return self.whole
 
 

@@ -59,7 +59,7 @@ def segment(
         Pixels shown to the model for each pixel of the map, along a side: memory grows with the map, not with the
         photograph.
     ways : int
-        Number of ways in which each tile is shown, at most 4: as it is, turned by half, turned over left to right
+        Number of ways in which each tile is shown, at most 4: as it is, turned by half, mirrored left to right
         and top to bottom. The mean counts: roads that are seen one way only are mostly none.
 
     Raises
