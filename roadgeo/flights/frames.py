@@ -33,7 +33,7 @@ from roadgeo.running.photographs import load_model
 from roadgeo.running.tasks import SUFFIXES, VIDEOS, find_masks, in_natural_order
 from roadgeo.running.variants import resampled
 from roadgeo.sources.exif import read_time
-from roadgeo.sources.georeference import read_pixel_shape
+from roadgeo.sources.georeference import read_stated
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.files import writing
 from roadgeo.storage.rasters import count_frames, is_raster, pages_of
@@ -193,7 +193,7 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
         if are_videos[n]:
             begun_s = yield from _video(path, options, stack, begun_s)
         else:
-            aspect = options.aspect or read_pixel_shape(path)[0] or 1.0
+            aspect = options.aspect or read_stated(path).aspect or 1.0
             pages, step_s, begun_s = pages_of(path), options.interval_s or 1.0, times[n] if times else begun_s
             for k, page in enumerate(pages, 1):
                 name = Path(path).name if len(pages) == 1 else f"{Path(path).stem}_page{k}"

@@ -227,7 +227,7 @@ class Locating:
         from roadgeo.outputs.location_document import read_answer
         from roadgeo.outputs.paths import output_paths
         from roadgeo.running.choosing import take_again
-        from roadgeo.sources.georeference import read_stated_middle
+        from roadgeo.sources.georeference import read_stated
 
         paths, taken = output_paths(self.out_dir, task.stem), self.options.taken
         try:
@@ -240,7 +240,7 @@ class Locating:
             return None
         kept = probability_path(paths)
         sighting = take_again(answer, taken, task.mask, kept, question.references, self.options.reading, options)
-        return sighting.showing(stated=read_stated_middle(task.mask))
+        return sighting.showing(stated=read_stated(task.mask).middle)
 
     def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the hints that the image's camera states where they were asked for."""

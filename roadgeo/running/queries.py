@@ -23,7 +23,7 @@ from roadgeo.running.photographs import Pass, call_segmenter, locate_photograph,
 from roadgeo.running.pictures import as_file
 from roadgeo.running.variants import Judge, undoing
 from roadgeo.sources.drawn_roads import draw_roads
-from roadgeo.sources.georeference import read_pixel_shape, read_stated_middle
+from roadgeo.sources.georeference import Stated, read_stated
 from roadgeo.sources.masks import MaskSource, is_photograph, open_mask
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.streams import EXCHANGED, QUERY_ENDINGS, TABLE_ENDINGS
@@ -74,7 +74,7 @@ def locate_query(
         location = sighting.location.saying("the georeference of the file mirrors it, which was undone")
         sighting = sighting.answering(location)
     if isinstance(path, str):
-        sighting = sighting.showing(stated=read_stated_middle(path))
+        sighting = sighting.showing(stated=query.middle)
     return sighting
 
 
@@ -89,6 +89,8 @@ class OpenQuery:
     aspect : float or None
         How many times a pixel is as wide as high; None: once.
     mirrored : bool
+    middle : (float, float) or None
+        Longitude and latitude that the file states (see `Stated`).
     mask : MaskSource or None
         The mask, open.
     """
@@ -97,6 +99,7 @@ class OpenQuery:
     kind: Literal["lines", "mask", "photograph"]
     aspect: float | None = None
     mirrored: bool = False
+    middle: tuple[float, float] | None = None
     mask: MaskSource | None = None
 
 
@@ -116,12 +119,13 @@ def open_query(path: str | AnyArray, reading: ReadOptions) -> Iterator[OpenQuery
     with open_mask(path, choice=reading.choice, threshold=reading.threshold) if by_values else nullcontext() as mask:
         if mask is not None and mask.photograph and reading.segment == "auto":
             mask = None
-        aspect, mirrored = read_pixel_shape(path) if isinstance(path, str) else (None, False)
+        stated = read_stated(path) if isinstance(path, str) else Stated()
         yield OpenQuery(
             path,
             "photograph" if mask is None else "mask",
-            aspect if reading.aspect is None else reading.aspect,
-            mirrored if reading.mirror is None else reading.mirror,
+            stated.aspect if reading.aspect is None else reading.aspect,
+            stated.mirrored if reading.mirror is None else reading.mirror,
+            stated.middle,
             mask,
         )
 

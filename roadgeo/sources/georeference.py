@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from roadgeo.storage.rasters import open_raster, read_sidecar
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["read_georeference", "read_pixel_shape", "read_stated_middle"]
+__all__ = ["Stated", "read_georeference", "read_stated"]
 
 _STEPS_ASIDE = 4  # orientations beyond this make rows of columns
 _WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
@@ -61,28 +61,36 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     return Georeference(matrix, own, size, source)
 
 
-def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | None:
-    """Return longitude and latitude of the middle of a raster by its own georeference, or of its camera by EXIF.
+class Stated(NamedTuple):
+    """What a picture states of its pixels and its place.
 
-    None where it has neither.
+    Attributes
+    ----------
+    aspect, mirrored
+        As of `Georeference.pixel_shape`. Without a georeference the resolution counts, as scanners and facsimiles state
+        it; (None, False) without that, too.
+    middle : (float, float) or None
+        Longitude and latitude of the middle by its georeference, or of the camera by EXIF.
     """
+
+    aspect: float | None = None
+    mirrored: bool = False
+    middle: tuple[float, float] | None = None
+
+
+def read_stated(path: str | os.PathLike[str]) -> Stated:
+    """Read what a raster, or a file beside it, states."""
     georeference = _stated(path)
-    middle = georeference.middle() if georeference is not None else (np.nan, np.nan)
-    return middle if np.isfinite(middle).all() else read_position(path)
-
-
-def read_pixel_shape(path: str | os.PathLike[str]) -> tuple[float | None, bool]:
-    """Return the shape of a raster's pixels as `Georeference.pixel_shape`; (None, False) where it states none.
-
-    Without a georeference its resolution counts, as scanners and facsimiles state it.
-    """
-    georeference = _stated(path)
-    if georeference is None:
-        across, down = read_resolution(path)
-        aspect = stretch_of(down, across)
-        turned = read_orientation(path) > _STEPS_ASIDE
-        return (1.0 / aspect if aspect and turned else aspect), False
-    return (None, False) if georeference.source == "control points" else georeference.pixel_shape()
+    middle = (np.nan, np.nan) if georeference is None else georeference.middle()
+    place = middle if np.isfinite(middle).all() else read_position(path)
+    if georeference is not None:
+        return Stated(
+            *((None, False) if georeference.source == "control points" else georeference.pixel_shape()), place
+        )
+    across, down = read_resolution(path)
+    aspect = stretch_of(down, across)
+    turned = read_orientation(path) > _STEPS_ASIDE
+    return Stated(1.0 / aspect if aspect and turned else aspect, False, place)
 
 
 def _stated(path: str | os.PathLike[str]) -> Georeference | None:

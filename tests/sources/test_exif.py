@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from roadgeo.cli import cli
 from roadgeo.errors import MaskError
 from roadgeo.sources.exif import read_focal_length, read_position, read_time
-from roadgeo.sources.georeference import read_stated_middle
+from roadgeo.sources.georeference import read_stated
 
 
 def jpeg_with_exif(path, focal_mm):
@@ -57,9 +57,8 @@ def test_the_camera_says_where_it_is(tmp_path, suffix, stated, place):
     if stated:
         exif[0x8825] = dict(enumerate(stated, 1))
     PIL.Image.new("RGB", (90, 60)).save(tmp_path / f"a.{suffix}", exif=exif)
-    for read in (read_position, read_stated_middle):
-        found = read(tmp_path / f"a.{suffix}")
-        assert found == (None if place is None else pytest.approx(place, abs=1e-6))
+    for read in (read_position(tmp_path / f"a.{suffix}"), read_stated(tmp_path / f"a.{suffix}").middle):
+        assert read == (None if place is None else pytest.approx(place, abs=1e-6))
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])

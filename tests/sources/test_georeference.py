@@ -19,7 +19,7 @@ from worlds.turned import mark_turned, save_turned
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
-from roadgeo.sources.georeference import read_georeference, read_pixel_shape
+from roadgeo.sources.georeference import read_georeference, read_stated
 from roadgeo.sources.roads import choose_roads
 
 PLACE = rasterio.Affine(0.5, 0.1, 330_000.0, 0.1, -0.5, 4_690_000.0)
@@ -240,7 +240,7 @@ def test_and_so_it_is_in_maps(tmp_path: Path, name: str, container: str) -> None
 def test_the_shape_of_pixels_is_as_the_file_states_it(tmp_path, crs, steps, shape) -> None:
     x, y = transformer("EPSG:4326", crs).transform(9.0, 60.0)
     path = write(tmp_path / "a.tif", crs=crs, transform=rasterio.Affine(steps[0], 0, x, 0, steps[1], y))
-    stretch, is_mirrored = read_pixel_shape(path)
+    stretch, is_mirrored, _ = read_stated(path)
     assert is_mirrored is shape[1]
     assert stretch == (None if shape[0] is None else pytest.approx(shape[0], rel=0.01))
 
@@ -257,13 +257,13 @@ def test_files_beside_a_picture_state_the_shape_of_its_pixels(tmp_path: Path, wh
             f"<SRS>{pyproj.CRS(32629).to_wkt('WKT1_GDAL')}</SRS><GeoTransform>530000,2,0,4557000,0,1</GeoTransform>"
         )
         (tmp_path / "a.png.aux.xml").write_text(f"<PAMDataset>{stated}</PAMDataset>")
-    aspect, is_mirrored = read_pixel_shape(tmp_path / "a.png")
+    aspect, is_mirrored, _ = read_stated(tmp_path / "a.png")
     assert aspect == pytest.approx(2.0, rel=1e-3)
     assert is_mirrored
 
 
 def test_files_that_state_no_shape_have_square_pixels(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
-    assert read_pixel_shape(tmp_path / "a.png") == (None, False)
-    assert read_pixel_shape(write(tmp_path / "a.tif")) == (None, False)
-    assert read_pixel_shape(write(tmp_path / "b.tif", transform=rasterio.Affine(0.5, 0, 0, 0, 0.7, 0))) == (None, False)
+    assert read_stated(tmp_path / "a.png") == (None, False, None)
+    assert read_stated(write(tmp_path / "a.tif"))[:2] == (None, False)
+    assert read_stated(write(tmp_path / "b.tif", transform=rasterio.Affine(0.5, 0, 0, 0, 0.7, 0)))[:2] == (None, False)

@@ -41,7 +41,7 @@ from roadgeo.serving.requests import ending_of, read_query_string
 from roadgeo.sources.camera import estimate_gsd
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import read_focal_length
-from roadgeo.sources.georeference import read_georeference, read_stated_middle
+from roadgeo.sources.georeference import read_georeference, read_stated
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
 from roadgeo.sources.roads import read_roads
@@ -145,7 +145,7 @@ def read_photograph(path: Path) -> None:
 
 def read_place(path: Path) -> None:
     """Read where a raster says that it lies, as all that uses it does."""
-    read_stated_middle(path)
+    read_stated(path)
     found = read_georeference(path, "EPSG:32629")
     if found is not None:
         found.middle()
