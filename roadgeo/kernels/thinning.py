@@ -95,13 +95,7 @@ def shallow_first(states: NDArray[np.uint8], distance: NDArray[np.float32]) -> N
 
 
 @kernel(writes=("states",))
-def thin(
-    states: Bytes2,
-    distance: Singles2,
-    pixels: Int32s1,
-    min_end_depth: float,
-    keep_pairs: bool,
-) -> Int32s1:
+def thin(states: Bytes2, distance: Singles2, pixels: Int32s1, min_end_depth: float, keep_pairs: bool) -> Int32s1:
     """Delete simple pixels among `pixels` until none is left, in place; return the pixels left.
 
     Parameters

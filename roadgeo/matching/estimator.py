@@ -129,7 +129,7 @@ class TripleEstimator:
         self._nearby: dict[Place, float] = {}
         self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
         self._equals_of: list[Place] = []  # whose own tuples were looked for elsewhere
-        self._whole: list[Place] = []  # verified, and no better version of them is to be expected
+        self.whole: list[Place] = []  # verified, and no better version of them is to be expected
         self.sweeps, self.scene, self.index = sweeps, sweeps.scene, index
         self.options = options or MatchOptions()
         camera, usual = self.options.camera, self.options.refine
@@ -231,10 +231,6 @@ class TripleEstimator:
         settled = self._settled.get(other)
         return settled is not None and settled.log10_likelihood >= _LEAST_LIKELY and settled.same(place)
 
-    def whole_places(self) -> list[Place]:
-        """Return the verified places that fit the whole frame."""
-        return self._whole
-
     def enough(self) -> bool:
         """Return whether the limit of screened places, for a map as large as all parts together, is reached."""
         n = max(self.ledger.n_reference, len(self.index))
@@ -274,7 +270,7 @@ class TripleEstimator:
         self.events.note("grown", [place.matrix for place in grown])
         distinct: list[Place] = []
         for place in filter(self._is_plausible, grown):
-            if not any(place.same(other) for other in (*self._whole, *distinct)):
+            if not any(place.same(other) for other in (*self.whole, *distinct)):
                 distinct.append(place)
                 yield place
 
@@ -319,7 +315,7 @@ class TripleEstimator:
         self.refine_s += time.perf_counter() - started
         self.events.note("settled", settled)
         if not settled.by_roads and self._fits_whole(settled):
-            self._whole.append(settled)
+            self.whole.append(settled)
         return settled, settled.score
 
     def _verify(self, place: Place) -> Place:

@@ -103,6 +103,7 @@ class Member(Protocol):
     """A part of a search, as the sweeps that it shares with others know it (see `estimator.Member`)."""
 
     index: ReferenceIndex
+    whole: list[Place]  # that fit the whole frame
 
     @property
     def units(self) -> IntArray:
@@ -120,9 +121,6 @@ class Member(Protocol):
     def enough(self) -> bool:
         """Return whether enough places were screened."""
 
-    def whole_places(self) -> Sequence[Place]:
-        """Return the places that fit the whole frame."""
-
 
 #: The places that grew from an anchor's proposals and are not taken yet, by the identity of their part.
 _Grown: TypeAlias = dict[int, list[Place]]
@@ -137,13 +135,7 @@ class SharedSweeps:
         The parts; all must join before the first takes a place.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        camera: CameraOptions,
-        ahead: Ahead = ALONE,
-        alone: bool = False,
-    ) -> None:
+    def __init__(self, scene: Scene, camera: CameraOptions, ahead: Ahead = ALONE, alone: bool = False) -> None:
         """Begin without parts; `alone`: of one, each unit of which has all of the bounds (see `cut_to_units`)."""
         self.scene, self.camera, self.ahead, self.alone = scene, camera, ahead, alone
         self.members: list[Member] = []
@@ -226,7 +218,7 @@ class SharedSweeps:
 
     def _is_met(self, place: Place, best: Sequence[tuple[Member, Place]]) -> bool:
         """Return whether another shard that overlaps this one has the same place."""
-        met = [*(other for _, other in best), *(other for member in self.members for other in member.whole_places())]
+        met = [*(other for _, other in best), *(other for member in self.members for other in member.whole)]
         beside = (other for other in met if other.index is not place.index and other.index.is_shard_beside(place.index))
         return any(other.same(place) for other in beside)
 

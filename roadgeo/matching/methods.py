@@ -171,7 +171,7 @@ def _search(
         return _search_pairs_in_turn(query, indexes, options, time_limit_s)
     started, ledger = time.perf_counter(), Ledger()
     sweeps = SharedSweeps(query.scene, options.match.camera, ahead)
-    begun = [_begin(query, index, options, Events(explained), ledger, sweeps) for index in indexes]
+    begun = [_begin(sweeps, index, options, Events(explained), ledger) for index in indexes]
     for result in begun:
         if result.estimator is not None and proposed:
             here = (matrix for index, matrix in proposed if index is result.index)
@@ -253,19 +253,14 @@ def may_show(part: Part, options: LocateOptions, frame_m: float) -> bool:
 
 
 def _begin(
-    query: Query,
-    index: ReferenceIndex,
-    options: LocateOptions,
-    events: Events,
-    ledger: Ledger,
-    sweeps: SharedSweeps,
+    sweeps: SharedSweeps, index: ReferenceIndex, options: LocateOptions, events: Events, ledger: Ledger
 ) -> Searched:
     """Return a result without places; it has an estimator, unless the reference has no intersection near the hint."""
     part, near, within = index, _near(index, options.near), options.match.within
     if within is not None and not Whole(index).touches(within):
         return Searched(index, events=events)
     if near is not None:
-        reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+        reach = _rounded_up(near[2] + 2.0 * sweeps.scene.half_size * options.match.camera.gsd_m[1])
         part = _part(index, near[:2], reach)
         if len(part) == 0:
             return Searched(index, events=events)

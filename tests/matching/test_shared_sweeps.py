@@ -46,9 +46,6 @@ class Part:
     def enough(self):
         return False
 
-    def whole_places(self):
-        return self.whole
-
 
 class Shard:
     """Of a map of which all others are."""
