@@ -1,12 +1,20 @@
 """What a frame shows around its photograph, and what a photograph does not show, is no ground: of any reader."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import PIL.Image
 import pytest
+import rasterio
 from worlds.rasters import write_raster
 from worlds.turned import save_turned
 
+from roadgeo.evaluation.demo import PHOTO
+from roadgeo.sources.masks import is_photograph
 from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -189,3 +197,92 @@ def test_the_tips_of_a_turned_picture_are_no_margins(
     assert not ground[~shown].any()
     assert [np.ptp(np.flatnonzero(ground.any(axis=axis))) for axis in (1, 0)] == pytest.approx(SHAPE, abs=8)
     assert "margins" not in caplog.text
+
+
+# --- forms in which people have photographs ---------------------------------------------------------------------------
+
+
+@cache
+def coloured() -> np.ndarray:
+    """(H, W, 3) uint8 RGB of the demonstration's photograph."""
+    return cv2.cvtColor(cv2.imread(str(PHOTO)), cv2.COLOR_BGR2RGB)[200:500, 300:700]
+
+
+def deep(kind: str, scale: float, offset: float = 0.0, **profile: Any) -> Callable[[Path], object]:
+    """Write with values of another type."""
+    return lambda path: write_raster(path, (np.moveaxis(coloured(), 2, 0) * scale + offset).astype(kind), **profile)
+
+
+def in_mode(mode: str, **how: Any) -> Callable[[Path], object]:
+    """Write in a mode of PIL's."""
+    return lambda path: PIL.Image.fromarray(coloured()).convert(mode).save(path, **how)
+
+
+def with_infrared(kind: str, **profile: Any) -> Callable[[Path], object]:
+    """Write with a fourth band, of the near infrared."""
+
+    def write(path: Path) -> object:
+        bands = np.moveaxis(coloured(), 2, 0)
+        return write_raster(path, np.stack([*bands, np.maximum(255 - bands[1], 1)]).astype(kind), **profile)
+
+    return write
+
+
+def masked_in_tiles(path: Path) -> None:
+    """Write tiles with an internal mask; what it hides is black."""
+    shown = np.ones(coloured().shape[:2], bool)
+    shown[:40, :40] = False
+    bands = np.moveaxis(coloured(), 2, 0) * shown.astype(np.uint8)
+    write_raster(path, bands, photometric="RGB", tiled=True, blockxsize=128, blockysize=128)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as dataset:
+        dataset.write_mask(shown)
+
+
+FORMS: dict[str, Callable[[Path], object]] = {
+    "16 bit.tif": deep("uint16", 257.0, photometric="RGB"),
+    "11 bit, no colours named.tif": deep("uint16", 8.0, 300.0, photometric="MINISBLACK"),
+    "16 bit.png": deep("uint16", 257.0, driver="PNG"),
+    "signed.tif": deep("int16", 8.0, photometric="MINISBLACK"),
+    "reflectance.tif": deep("float32", 0.3 / 255.0, photometric="MINISBLACK"),
+    "big-endian.tif": deep("uint8", 1.0, photometric="RGB", ENDIANNESS="BIG"),
+    "big-endian, large, 16 bit.tif": deep("uint16", 257.0, photometric="RGB", ENDIANNESS="BIG", bigtiff="YES"),
+    "bands apart.tif": deep("uint8", 1.0, photometric="RGB", interleave="band", compress="lzw"),
+    "YCbCr.tif": deep("uint8", 1.0, photometric="YCBCR", compress="jpeg"),
+    "jpeg 2000.jp2": deep("uint8", 1.0, driver="JP2OpenJPEG"),
+    "masked tiles.tif": masked_in_tiles,
+    "infrared.tif": with_infrared("uint8", photometric="RGB"),
+    "infrared, no colours named.tif": with_infrared("uint16", photometric="MINISBLACK"),
+    "infrared for alpha.tif": with_infrared("uint8", photometric="RGB", alpha="yes"),
+    "CMYK.jpg": in_mode("CMYK", quality=95),
+    "CMYK.tif": in_mode("CMYK"),
+    "palette.png": lambda path: PIL.Image.fromarray(coloured()).quantize(256).save(path),
+    "palette.gif": lambda path: PIL.Image.fromarray(coloured()).quantize(256).save(path),
+    "palette.tif": lambda path: PIL.Image.fromarray(coloured()).quantize(256).save(path),
+    "grey.jpg": in_mode("L", quality=95),
+    "grey with alpha.png": in_mode("LA"),
+    "alpha.png": in_mode("RGBA"),
+    "progressive.jpg": in_mode("RGB", progressive=True, quality=95),
+    "webp.webp": in_mode("RGB", quality=95),
+    "array.npy": lambda path: np.save(path, coloured()),
+    **{
+        f"turned {n}.{suffix}": lambda path, n=n: save_turned(path, coloured(), n)
+        for n in range(2, 9)
+        for suffix in ("jpg", "tif")
+    },
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_photograph_is_the_same_in_every_form(tmp_path: Path, form: str) -> None:
+    FORMS[form](tmp_path / form)
+    assert is_photograph(tmp_path / form)
+    with open_photograph(tmp_path / form) as opened:
+        assert (opened.height, opened.width) == coloured().shape[:2]
+        rgb, valid = opened.read(0.0, 0.0, opened.width, opened.height, (opened.height, opened.width))
+    assert valid[40:, 40:].all()
+    assert valid[:40, :40].all() == (form != "masked tiles.tif")
+    seen, right = (np.moveaxis(picture[40:, 40:], 2, 0) for picture in (rgb, coloured()))
+    if "grey" in form:
+        seen, right = (picture.mean(axis=0, keepdims=True) for picture in (seen, right))
+    for band, same in zip(seen, right, strict=True):
+        assert np.corrcoef(band.ravel(), same.ravel())[0, 1] > 0.95
