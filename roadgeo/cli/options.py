@@ -325,13 +325,20 @@ class Read(click.ParamType):  # type: ignore[type-arg]  # generic only in late v
 class Plugin(click.ParamType):  # type: ignore[type-arg]
     """The name of a plugin, and with `has_argument` a colon and its argument: "osm:Boston, MA".
 
-    `names` gives the names that are known; a file that ends as `file_ending` says is taken too.
+    `names` gives the names that are known; a file that ends as `file_ending` says is taken too. `options` of their own
+    stand for others.
     """
 
     name = "plugin"
 
-    def __init__(self, names: Callable[[], Sequence[str]], has_argument: bool = False, file_ending: str = "") -> None:
-        self.names, self.has_argument, self.file_ending = names, has_argument, file_ending
+    def __init__(
+        self,
+        names: Callable[[], Sequence[str]],
+        has_argument: bool = False,
+        file_ending: str = "",
+        options: Mapping[str, str] | None = None,
+    ) -> None:
+        self.names, self.has_argument, self.file_ending, self.options = names, has_argument, file_ending, options or {}
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Check that it is there; nothing of it is imported or read.
@@ -350,7 +357,8 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         installed = self.names()
         if text and (name not in installed or bool(colon) != self.has_argument):
             expected = ", ".join(f"{plugin}:WHERE" if self.has_argument else plugin for plugin in installed)
-            self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
+            hint = f"; it has an option of its own: {self.options[name]}" if name in self.options else ""
+            self.fail(f"got {text!r}, expected one of {expected}{hint}", param, ctx)
         return text
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[Any]:  # noqa: ARG002
@@ -430,7 +438,7 @@ class Shared:
     recursive: bool = option("--recursive", "", IMAGE, "Also take the images of folders within folders.")
     products: tuple[str, ...] = option("--also", "NAME", RESULTS,
         "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
-        type=Plugin(offered), multiple=True, default=())
+        type=Plugin(offered, options={"overlay": "--plot", "report": "--report"}), multiple=True, default=())
     jobs: int = option("-j --jobs", "N", SEARCH,
         "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
         "Default: 1.", limits=(1, None), default=1, show_default=False)

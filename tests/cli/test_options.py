@@ -188,3 +188,9 @@ def test_what_may_be_given_more_often_may() -> None:
     ]
     given = command("locate").make_context("locate", typed).params
     assert (given["references"], given["products"]) == (("x", "y"), ("kmz", "gcps"))
+
+
+@pytest.mark.parametrize(("name", "option"), [("overlay", "--plot"), ("report", "--report")])
+def test_outputs_that_have_an_option_name_it(capsys: pytest.CaptureFixture[str], name: str, option: str) -> None:
+    assert main(["locate", "a.png", "--also", name]) == 2
+    assert f"it has an option of its own: {option}" in capsys.readouterr().err
