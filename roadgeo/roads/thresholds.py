@@ -45,8 +45,8 @@ _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
 #: Smooth edges of a plain mask are a pixel wide: they have at most two neighbours in three of their value.
 _ALIKE, _OTHERS_ALIKE = 0.9, 0.8
 #: The same saved as JPEG: roads are clearly lighter than the ground, and than the traces that JPEG leaves around them.
-#: Of the greatest value nearby (pixels), few have half: 0.25 of those that have most of it, 0.39 in soft maps. Many
-#: have less than most of the lightest roads: 0.4, none in plain masks.
+#: Few values are about half of the greatest nearby (pixels): 0.25 of those that are most of it, 0.39 in soft maps.
+#: Many roads have less than most of the lightest: 0.4, none in plain masks.
 _CLEAR, _RINGING, _NEARBY_PX, _HALF, _MOST, _FEW, _MANY = 48, 20, 7, 0.3, 0.7, 0.3, 0.25
 _GREY = 6  # bands of a grey picture differ by this at most, rounded by JPEG or WebP
 #: Share of neighbours that differ in a photograph, and their usual difference, of the span.

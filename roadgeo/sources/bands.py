@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -112,8 +112,7 @@ def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: 
         yield _of_array(np.ma.asanyarray(source), choice, name or "array")
         return
     with open_raster(source, name) as dataset:
-        bands = _of_dataset(dataset, choice, name or os.fspath(source), sidecar_nodata(source))
-        yield replace(bands, page=page_of(source))
+        yield _of_dataset(dataset, choice, name or os.fspath(source), sidecar_nodata(source), page_of(source))
 
 
 def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
@@ -140,7 +139,7 @@ def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
     return Bands(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen, option="")
 
 
-def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None) -> Bands:
+def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None, page: str) -> Bands:
     """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
     from rasterio.enums import MaskFlags
     from rasterio.windows import Window
@@ -179,7 +178,7 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
     size, own = (dataset.height, dataset.width), _model_threshold(dataset)
-    return Bands(name, size, read, bands, labels, has_alpha, is_chosen, model_threshold=own)
+    return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page, own)
 
 
 def _half_opaque(dataset: DatasetReader, band: int) -> int:

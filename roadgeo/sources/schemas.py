@@ -283,10 +283,7 @@ def _rules(value: Any) -> list[tuple[tuple[float, float], list[str]]]:
     rules, lists = _json(value), list | tuple | np.ndarray
     mappings = [rule for rule in rules if isinstance(rule, dict)] if isinstance(rules, lists) else []
     return [
-        (
-            _span(rule.get("between")),
-            [flag for flag in map(str, flags) if in_tunnel(objects([flag]))[0] or _is_unbuilt(flag)],
-        )
+        (_span(rule.get("between")), [flag for flag in map(str, flags) if _hides(flag) or _is_unbuilt(flag)])
         for rule in mappings
         if isinstance(flags := rule.get("values"), lists)
     ]
@@ -312,8 +309,8 @@ def _parted(shapes: AnyArray, values: AnyArray) -> tuple[AnyArray, IntArray, Any
         for low, high in pairwise(ends if isinstance(shape, shapely.LineString) else (0.0, 1.0)):
             flags = ";".join(flag for (start, end), held in rules if start <= (low + high) / 2 <= end for flag in held)
             if not _is_unbuilt(flags):
-                whole = high - low == 1.0
-                pieces.append((shape if whole else substring(shape, low, high, normalized=True), k, flags))
+                part = shape if high - low == 1.0 else substring(shape, low, high, normalized=True)
+                pieces.append((part, k, flags))
     parted, of, held = zip(*pieces, strict=True) if pieces else ((), (), ())
     return objects(parted), np.array(of, np.intp), objects(held)
 
@@ -334,12 +331,15 @@ def _json(value: Any) -> Any:
 
 def _tunnel_of(name: str, value: Any) -> Any:
     """Return OpenStreetMap's words for what a column of this name tells of a tunnel."""
-    begins = _TUNNELS[name]
-    return value if not begins else "yes" if _begins(begins, value) else "no"
+    return value if not _TUNNELS[name] else "yes" if _begins(_TUNNELS[name], value) else "no"
 
 
 def _begins(pattern: str, value: Any) -> bool:
     return re.match(pattern, str(value).strip(), re.IGNORECASE) is not None
+
+
+def _hides(flag: str) -> bool:
+    return bool(in_tunnel(objects([flag]))[0])
 
 
 def _is_unbuilt(flags: str) -> bool:
