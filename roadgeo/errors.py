@@ -152,7 +152,8 @@ _NO_MEMORY = re.compile(
 
 def is_of_memory(error: BaseException) -> bool:
     """Whether an error, of whatever library, states that there is no memory left."""
-    return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
+    is_one = isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
+    return is_one or (error.__cause__ is not None and is_of_memory(error.__cause__))
 
 
 def name_package(error: ModuleNotFoundError) -> MissingPackageError | None:

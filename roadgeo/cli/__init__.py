@@ -23,7 +23,7 @@ from roadgeo.cli.fencing import OWN_PROCESS
 from roadgeo.cli.printing import complain, echo, own_log
 from roadgeo.errors import RoadgeoError, is_of_memory, name_package
 from roadgeo.storage.fence import remedy
-from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
+from roadgeo.storage.gdal import forget_missing_proj_data
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "Group", "cli", "main"]
 
@@ -157,7 +157,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ["PYTHONSAFEPATH"] = "1"  # no process of ours imports what lies in the current folder
         if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
             signal.signal(signal.SIGTERM, _terminate)
-    skip_drivers()
     forget_missing_proj_data()
     try:
         status = cli.main(

@@ -95,7 +95,7 @@ def _set_place(path: Path, place: Georeference) -> None:
     try:
         with warnings.catch_warnings(), ExitStack() as files:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)  # it is about to be
-            raster = files.enter_context(rasterio.open(path, "r+"))
+            raster = files.enter_context(rasterio.open(path, "r+", driver="GTiff"))
             if np.allclose(place.matrix[2], (0, 0, 1), atol=1e-15):
                 raster.crs, raster.transform = place.crs, rasterio.Affine(*place.matrix[:2].ravel())
             else:

@@ -10,10 +10,8 @@ import pickle
 import pickletools
 from typing import Any, NoReturn
 
-__all__ = ["MAX_PICKLE", "PlainUnpickler", "dump_plain", "load_plain", "require_plain"]
+__all__ = ["PlainUnpickler", "dump_plain", "load_plain", "require_plain"]
 
-#: Bytes: far above what any reference needs.
-MAX_PICKLE = 1 << 20
 _MAX_DEPTH = 16
 
 #: Opcodes of a protocol-5 pickle of plain values, written without a memo. None looks up a name, calls, or refers back;
@@ -64,17 +62,13 @@ def dump_plain(value: dict[str, Any]) -> bytes:
     Raises
     ------
     TypeError
-        They hold something else, or too much.
+        They hold something else.
     """
     require_plain(value)
     buffer = io.BytesIO()
     pickler = pickle.Pickler(buffer, protocol=5)
     pickler.fast = True
     pickler.dump(value)
-    if buffer.tell() > MAX_PICKLE:
-        raise TypeError(
-            f"an index's plain values are too large: got {buffer.tell()} bytes, expected at most {MAX_PICKLE}"
-        )
     return buffer.getvalue()
 
 

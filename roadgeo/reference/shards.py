@@ -37,6 +37,7 @@ from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
 from roadgeo.storage.files import write_text
+from roadgeo.storage.memory import bounded
 
 __all__ = [
     "ENDING",
@@ -55,7 +56,6 @@ SCHEMA = "roadgeo.shards/1"
 ENDING = ".shards"
 
 _MANIFEST = "manifest.json"
-_MAX_MANIFEST = 256 << 20
 
 #: Names that a folder or a shard may have: none leads elsewhere.
 _NAME = re.compile(r"[\w-]{1,80}")
@@ -180,9 +180,8 @@ def read_manifest(path: Path) -> Manifest:
     """
     again = "build it again with `roadgeo index --shards`"
     try:
-        if path.stat().st_size > _MAX_MANIFEST:
-            raise IndexFormatError(f"{path}: is too large to be a manifest of shards; {again}")
-        return _parse_manifest(json.loads(path.read_text(encoding="utf-8")))
+        with bounded(path, IndexFormatError):
+            return _parse_manifest(json.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise IndexFormatError(f"{path}: {(error.strerror or str(error)).lower()}; {again}") from error
     except (ValueError, TypeError, LookupError, RecursionError) as error:

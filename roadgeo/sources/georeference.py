@@ -14,7 +14,7 @@ from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
 from roadgeo.sources.exif import read_position
 from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
-from roadgeo.storage.rasters import open_raster, read_sidecar
+from roadgeo.storage.rasters import open_raster, read_beside, read_sidecar
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["Stated", "read_georeference", "read_stated"]
 
 _STEPS_ASIDE = 4  # orientations beyond this make rows of columns
-_WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
 _HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
 
@@ -113,9 +112,9 @@ def _crs_beside(path: Path) -> str | None:
     """Read the CRS in the `.prj` beside a picture, or in its `.aux.xml`."""
     for suffix in (".prj", ".PRJ"):
         beside = path.with_suffix(suffix)
-        if beside.is_file() and beside.stat().st_size <= _PRJ_BYTES:
+        if stated := read_beside(path, beside).strip():
             try:
-                return name_crs(beside.read_text("utf-8", "replace").strip())
+                return name_crs(stated)
             except CrsError as error:
                 raise CrsError(f"{beside}: {error}") from error
     stated = read_sidecar(path, "SRS")
@@ -151,10 +150,10 @@ def _of_world_file(path: Path) -> FloatArray | None:
     names = [name + more for name in (short, f"{suffix}w", ".wld") for more in ("", "x")]
     for candidate in (*names, *map(str.upper, names)):
         beside = path.with_suffix(candidate)
-        if not beside.is_file() or beside.stat().st_size > _WORLD_FILE_BYTES:
+        if not (stated := read_beside(path, beside)):
             continue
         try:
-            a, d, b, e, c, f = (float(word.replace(",", ".")) for word in beside.read_text("ascii").split()[:6])
+            a, d, b, e, c, f = (float(word.replace(",", ".")) for word in stated.split(None, 6)[:6])
         except ValueError as error:
             raise MaskError(f"{beside}: no world file; expected six numbers, one per line") from error
         # A world file speaks of the first pixel's centre.

@@ -31,7 +31,6 @@ from typing import Any
 from roadgeo.errors import OutputError
 from roadgeo.storage.files import make_folder, make_temporary_folder, stage
 from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, user_dir, writable
-from roadgeo.storage.gdal import skip_drivers
 
 __all__ = ["Fence", "abi_version", "current", "is_inside", "is_started_inside", "remedy"]
 
@@ -123,7 +122,6 @@ class Fence:
 
     def _prepare(self) -> None:
         """Make the folders that are to be written, temporary ones too; settle what libraries look up elsewhere."""
-        skip_drivers()  # one of them writes where a file says, and so where machine code is kept
         with contextlib.suppress(RuntimeError):
             os.environ.setdefault("HOME", str(Path.home()))  # else the system's list of users is read
         # Arrow's usual pool reserves 1 GB at once: all that the reading of a small file may take (`storage.memory`).

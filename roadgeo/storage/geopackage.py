@@ -23,6 +23,7 @@ from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage_sql import RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
+from roadgeo.storage.memory import bounded
 from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
@@ -212,7 +213,7 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
     if not source.is_file():
         raise IndexFormatError(f"no such file: {source}; give the path of a .gpkg file")
     try:
-        with opened(source) as database:
+        with bounded(source, IndexFormatError), opened(source) as database:
             yield database
     except sqlite3.Error as error:
         raise IndexFormatError(f"{source} is no readable GeoPackage ({error}); make it again") from error

@@ -7,15 +7,16 @@ import ctypes
 import mmap
 import os
 import re
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import RoadSourceError, is_of_memory
+from roadgeo.errors import RoadgeoError, RoadSourceError, is_of_memory
 from roadgeo.storage.fence import is_inside
 
 __all__ = ["MEMORY", "bounded", "each_bounded", "give_back_memory", "let_pages_go"]
@@ -30,41 +31,64 @@ _FREE, _TIMES = 1 << 30, 100
 
 
 @contextlib.contextmanager
-def bounded(path: str | os.PathLike[str], before: int | None = None) -> Iterator[None]:
+def bounded(
+    path: str | os.PathLike[str], fault: type[RoadgeoError] = RoadSourceError, before: int | None = None
+) -> Iterator[None]:
     """Bound the memory that the block takes to read a file: inside the fence, or where ROADGEO_MEMORY sets how much.
 
     The bound is one of the whole process, and so not for programs that merely use roadgeo.
 
     Parameters
     ----------
+    fault : class
+        The error that is raised where it takes more.
     before : int, optional
         What the process held before the file was opened, bytes; by default what it holds now.
 
-    Raises
-    ------
-    RoadSourceError
-        It takes more.
     """
-    held = _held_bytes() if before is None else before
-    if held is None or not (is_inside() or MEMORY in os.environ):
+    held, thread = _held_bytes() if before is None else before, threading.get_ident()
+    if held is None or thread in _bounds or not (is_inside() or MEMORY in os.environ):
         yield
         return
-    import resource
-
     most = _allowance(path)
-    kept, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    limits = [limit for limit in (held + most, kept, hard) if limit != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
+    _set_bound(thread, (held, most))
     try:
         yield
     except Exception as error:
         if not is_of_memory(error):
             raise
-        raise RoadSourceError(
+        raise fault(
             f"{os.fspath(path)}: takes more than {most / 1e9:.1f} GB of memory to read; if you trust it, --memory GB"
         ) from error
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (kept, hard))
+        _set_bound(thread, None)
+
+
+#: The bound of each thread that reads: what the process held before, and how much more it may take, bytes.
+_bounds: dict[int, tuple[int, int]] = {}
+_LOCK = threading.Lock()
+_UNLIMITED = 1 << 64  # -1 stands for no limit
+
+
+def _set_bound(thread: int, bound: tuple[int, int] | None) -> None:
+    """Have the system refuse this process more memory than its threads may take together; None ends a thread's."""
+    import resource
+
+    with _LOCK:
+        own, hard = _own_limits()
+        _bounds.pop(thread, None)
+        _bounds.update({} if bound is None else {thread: bound})
+        before, more = zip(*_bounds.values(), strict=True) if _bounds else ((own,), (0,))
+        limit = min(own, min(before) + sum(more), key=lambda limit: limit % _UNLIMITED)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+
+@cache
+def _own_limits() -> tuple[int, int]:
+    """Return the limits that this process was started with."""
+    import resource
+
+    return resource.getrlimit(resource.RLIMIT_DATA)
 
 
 def each_bounded(
@@ -76,7 +100,7 @@ def each_bounded(
     def read_bounded(path: Path, /, *args: _P.args, **kwargs: _P.kwargs) -> Iterator[_Part]:
         before, rest = _held_bytes(), read(path, *args, **kwargs)
         while True:
-            with bounded(path, before):
+            with bounded(path, before=before):
                 part = next(rest, None)
             if part is None:
                 return

@@ -16,10 +16,11 @@ import shutil
 import stat
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,8 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.fence import is_inside, remedy
-from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, are_skipped, skipping
+from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers
+from roadgeo.storage.memory import bounded
 from roadgeo.storage.orientation import (
     UPRIGHT,
     read_orientation,
@@ -50,6 +52,7 @@ __all__ = [
     "page_of",
     "pages_of",
     "raster_size",
+    "read_beside",
     "read_palette",
     "read_sidecar",
     "require_file",
@@ -80,12 +83,10 @@ _DRIVERS = (
     (rb"EHFA_HEADER_TAG", "HFA"),
     (rb"\s*(<\?xml[^>]*>\s*)?<VRTDataset", "VRT"),
 )
+#: Drivers that write our results, from the pixels of others.
+_WRITTEN = ("MEM", "COG")
 _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine, .npy"
 
-#: A block is decoded whole: more than this for one is a bomb, or should be tiled.
-_MAX_BLOCK_BYTES = 2 << 30
-_MAX_SIDECAR = 1 << 20
-_MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
@@ -161,12 +162,15 @@ def open_raster(
             # What a virtual raster of a stranger names is read inside the fence, but not fetched.
             may_fetch = remote or (drivers == ["VRT"] and (is_ours or "VRT" in allowed_drivers()))
             with _opened(f"GTIFF_DIR:{page[1]}:{where}" if page else where, drivers, may_fetch) as dataset:
-                _require_plain(dataset, name)
+                if dataset.tags(ns="OVERVIEWS"):
+                    raise MaskError(
+                        f"{name}: names a file elsewhere as its overviews; remove that (gdal_edit.py -unsetmd)"
+                    )
                 orientation = _orientation(dataset, path, remote) if upright else UPRIGHT
                 if orientation == UPRIGHT:
                     yield dataset
                 else:
-                    with _turned(dataset, orientation, name) as turned:
+                    with _turned(dataset, orientation) as turned:
                         yield turned
         except UnicodeEncodeError as error:
             raise MaskError(f"{name}: its name is not valid text; rename it") from error
@@ -235,9 +239,14 @@ def _is_remote(path: str | os.PathLike[str]) -> bool:
 
 def require_there(path: str) -> None:
     """Raise `MaskError` where the file of a picture, or of a page of one, is missing; what is remote may be there."""
-    page = _PAGE.fullmatch(path)
     if not _is_remote(path):
-        require_file(page[2] if page else path, path)
+        require_file(_file_of(path), path)
+
+
+def _file_of(name: str) -> str:
+    """Return the path of a raster's file, of which this may be a page."""
+    page = _PAGE.fullmatch(name)
+    return page[2] if page else name
 
 
 def require_file(path: str | os.PathLike[str], name: str) -> None:
@@ -279,12 +288,20 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
 
 def read_sidecar(path: str | os.PathLike[str], name: str) -> str:
     """Return the text of an element in the `.aux.xml` beside a raster; "" without one. No more is taken of it."""
-    beside = Path(os.fspath(path) + ".aux.xml")
-    if not beside.is_file() or beside.stat().st_size > _MAX_SIDECAR:
-        return ""
-    text = beside.read_text("utf-8", "replace")
-    match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", text)
+    match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", read_beside(path, Path(os.fspath(path) + ".aux.xml")))
     return html.unescape(match[1]).strip() if match else ""
+
+
+def read_beside(path: str | os.PathLike[str], beside: Path) -> str:
+    """Return the text of a file beside a raster; "" without one.
+
+    Raises
+    ------
+    MaskError
+        It takes too much memory.
+    """
+    with bounded(path, MaskError):
+        return beside.read_text("utf-8", "replace") if beside.is_file() else ""
 
 
 #: Suffixes of images, which no text has.
@@ -310,7 +327,7 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
     if not head:
         raise MaskError(f"{name}: is empty; copy or export it again")
     driver = _driver_of(head)
-    if driver == "VRT" and "VRT" not in more and not (is_inside() and are_skipped()):
+    if driver == "VRT" and "VRT" not in more and not is_inside():
         raise MaskError(
             f"{name}: a GDAL virtual raster, which names other files to read: give those, "
             f"or set {CONSENT}=VRT if you trust it"
@@ -437,14 +454,15 @@ def _opened(path: str, drivers: list[str], may_fetch: bool) -> Iterator[DatasetR
     import rasterio
     from rasterio.errors import RasterioIOError
 
+    if drivers == ["VRT"] and is_inside():
+        _keep_few_drivers()
     with rasterio.Env(
         GDAL_CACHEMAX=_CACHE_BYTES,
-        **skipping(),
         **{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)},
     ):
         for last, driver in enumerate(drivers, 1 - len(drivers)):
             try:
-                dataset = rasterio.open(path, driver=driver)
+                dataset = _reader()(path, driver=driver)
             except RasterioIOError:
                 if last == 0:
                     raise
@@ -454,6 +472,43 @@ def _opened(path: str, drivers: list[str], may_fetch: bool) -> Iterator[DatasetR
             return
 
 
+@cache
+def _reader() -> type[DatasetReader]:
+    """Return rasterio's class of open rasters, which opens and reads them within the bound on memory."""
+    from rasterio import DatasetReader
+
+    def within(act: Callable[..., Any]) -> Callable[..., Any]:
+        def bounded_act(raster: DatasetReader, *args: Any, **kwargs: Any) -> Any:
+            name = str(args[0]) if act is DatasetReader.__init__ else raster.name
+            with bounded(_file_of(name), MaskError):
+                return act(raster, *args, **kwargs)
+
+        return bounded_act
+
+    acts = ("__init__", "read", "read_masks", "dataset_mask")
+    return type("BoundedReader", (DatasetReader,), {name: within(getattr(DatasetReader, name)) for name in acts})
+
+
+@cache
+def _keep_few_drivers() -> None:
+    """Have rasterio's GDAL forget all drivers but those above, whatever build it is: for what a virtual raster names.
+
+    It is for good, as the fence is.
+    """
+    from rasterio import _env
+
+    env = _env.GDALEnv()
+    skipped = ""
+    for _ in range(2):  # all are registered, and then the others left out
+        env.update_config_options(GDAL_SKIP=f"{skipped},")
+        _env._have_registered_drivers = False
+        env.start()
+        kept = {*_WRITTEN, *allowed_drivers(), *(driver for _, driver in _DRIVERS)}
+        skipped = ",".join(env.drivers().keys() - kept)
+        env.stop()
+    env.clear_config_options()
+
+
 @contextmanager
 def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetReader]:
     """Copy an array into memory as a raster: (H, W), or with bands first or last."""
@@ -461,22 +516,24 @@ def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetRe
     from rasterio.errors import NotGeoreferencedWarning
 
     try:
-        array = _bands_first(_read_array(path))
+        with bounded(path, MaskError):
+            array = _bands_first(_read_array(path))
     except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
         reason = " ".join(str(error).split())[:200]
         raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers") from error
     if array is None or array.dtype.kind not in "biuf":
         what = "" if array is None else f" of {array.dtype}"
         raise MaskError(f"{name}: holds an array{what}; expected (rows, columns) of real numbers, bands first or last")
-    if max(array.shape[1:]) > MAX_SIDE or array.nbytes > _MAX_TURNED_BYTES:
-        raise MaskError(f"{name}: an array of {array.shape}, {array.nbytes / 1e9:.1f} GB; save it as GeoTIFF")
     kind = "uint8" if array.dtype.kind == "b" else "float32" if array.dtype == np.float16 else array.dtype.name
     kind = "float64" if array.dtype.kind == "f" and array.dtype.itemsize > 8 else kind
     count, height, width = array.shape
     warnings.simplefilter("ignore", NotGeoreferencedWarning)
-    with rasterio.open("", "w+", driver="MEM", count=count, height=height, width=width, dtype=kind) as raster:
-        for band in range(count):
-            raster.write(np.asarray(array[band], kind), band + 1)
+    with ExitStack() as stack:
+        with bounded(path, MaskError):
+            kept = rasterio.open("", "w+", driver="MEM", count=count, height=height, width=width, dtype=kind)
+            raster = stack.enter_context(kept)
+            for band in range(count):
+                raster.write(np.asarray(array[band], kind), band + 1)
         raster.transform = rasterio.Affine.identity()
         yield raster
 
@@ -512,24 +569,20 @@ def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: b
 
 
 @contextmanager
-def _turned(dataset: DatasetReader, orientation: int, name: str) -> Iterator[DatasetReader]:
+def _turned(dataset: DatasetReader, orientation: int) -> Iterator[DatasetReader]:
     """Make an upright copy of a raster in memory, with all its metadata."""
     import rasterio
     from rasterio.control import GroundControlPoint
     from rasterio.enums import ColorInterp, MaskFlags
 
-    size = dataset.count * dataset.width * dataset.height * max(np.dtype(kind).itemsize for kind in dataset.dtypes)
-    if size > _MAX_TURNED_BYTES:
-        raise MaskError(
-            f"{name}: is to be turned (its orientation is {orientation}), and too large for that, {size / 1e9:.1f} GB: "
-            "save it upright"
-        )
     height, width = dataset.shape if orientation < 5 else dataset.shape[::-1]
     matrix = stored_from_upright(orientation, (width, height))
     profile = {"count": dataset.count, "dtype": np.result_type(*dataset.dtypes), "nodata": dataset.nodata}
-    with rasterio.open("", "w+", driver="MEM", width=width, height=height, **profile) as copy:
-        for band in dataset.indexes:
-            copy.write(turn_upright(dataset.read(band), orientation), band)
+    with ExitStack() as stack:
+        with bounded(_file_of(dataset.name), MaskError):
+            copy = stack.enter_context(rasterio.open("", "w+", driver="MEM", width=width, height=height, **profile))
+            for band in dataset.indexes:
+                copy.write(turn_upright(dataset.read(band), orientation), band)
         copy.colorinterp, copy.descriptions = dataset.colorinterp, dataset.descriptions
         if dataset.colorinterp[0] == ColorInterp.palette:
             copy.write_colormap(1, dataset.colormap(1))
@@ -548,17 +601,3 @@ def _turned(dataset: DatasetReader, orientation: int, name: str) -> Iterator[Dat
         if dataset.crs:
             copy.crs = dataset.crs
         yield copy
-
-
-def _require_plain(dataset: DatasetReader, name: str) -> None:
-    """Refuse rasters whose metadata have other files opened by any driver, or that cannot be decoded in parts."""
-    if dataset.tags(ns="OVERVIEWS"):
-        raise MaskError(f"{name}: names a file elsewhere as its overviews; remove that (gdal_edit.py -unsetmd)")
-    block = max(
-        height * width * np.dtype(dtype.replace("complex_int16", "int32")).itemsize
-        for (height, width), dtype in zip(dataset.block_shapes, dataset.dtypes, strict=True)
-    )
-    if dataset.interleaving is not None and dataset.interleaving.value == "PIXEL":
-        block *= dataset.count
-    if block > _MAX_BLOCK_BYTES:
-        raise MaskError(f"{name}: its blocks are of {block / 1e9:.1f} GB each when decoded; save it in tiles")

@@ -30,8 +30,6 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
             yield database
         except UnicodeDecodeError as error:  # of a message that quotes the file
             raise sqlite3.DatabaseError("its schema is no text") from error
-        except MemoryError as error:  # SQLite's own: of a size in the file
-            raise sqlite3.DatabaseError("it claims to hold more than fits into memory") from error
 
 
 def _guard(database: sqlite3.Connection, path: Path) -> None:

@@ -21,7 +21,8 @@ from roadgeo.cli import cli
 from roadgeo.cli.fencing import fence_of
 from roadgeo.storage.fence import abi_version
 from roadgeo.storage.folders import cache_dir
-from roadgeo.storage.rasters import raster_size
+from roadgeo.storage.gdal import CONSENT
+from roadgeo.storage.rasters import _DRIVERS, _WRITTEN, raster_size
 
 pytestmark = pytest.mark.skipif(not abi_version(), reason="this system has no Landlock (Linux 5.13 and later)")
 
@@ -143,11 +144,21 @@ def test_what_a_virtual_raster_names_writes_nothing_where_machine_code_is_kept(t
     (tmp_path / "given").mkdir()
     virtual(tmp_path / "given", str(mrf(tmp_path / "given", tmp_path / "cache" / "planted")))
     command = [sys.executable, "-c", VIRTUAL, str(tmp_path / "given"), gdal]
-    environment = {name: value for name, value in os.environ.items() if name != "GDAL_SKIP"}
-    environment |= {"ROADGEO_CACHE": str(tmp_path / "cache"), "ROADGEO_LIBRARY": str(tmp_path / "library")}
+    environment = {**surroundings(tmp_path), "ROADGEO_CACHE": str(tmp_path / "cache")}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
     assert not (tmp_path / "cache" / "planted").exists()
-    assert ("virtual raster" if gdal == "loaded" else "not recognized") in done.stdout
+    assert "not recognized" in done.stdout
+
+
+def test_no_driver_of_any_build_is_left_but_those_that_are_listed(tmp_path: Path) -> None:
+    """Builds of GDAL have drivers of their own; a program may have loaded it, and be reading, before."""
+    virtual(tmp_path, "nothing.tif")
+    code = VIRTUAL + "with rasterio.Env() as env:\n    print(*sorted(env.drivers()), sep=',')"
+    command = [sys.executable, "-c", code, str(tmp_path), "loaded"]
+    environment = {**surroundings(tmp_path), CONSENT: "netCDF,ENVI"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+    left = {*done.stdout.splitlines()[-1].split(",")}
+    assert {"GTiff", "PNG", "VRT"} <= left <= {*_WRITTEN, *(driver for _, driver in _DRIVERS), "netCDF", "ENVI"}
 
 
 @pytest.mark.parametrize(
@@ -161,7 +172,6 @@ def test_a_virtual_raster_fetches_nothing_where_connections_are_made(tmp_path: P
         code = VIRTUAL.replace("sys.argv[1])", "sys.argv[1], network=True)")
         command = [sys.executable, "-c", code, str(tmp_path / "given"), "not loaded"]
         environment = {**surroundings(tmp_path), "no_proxy": "127.0.0.1"}
-        environment.pop("GDAL_SKIP", None)
         subprocess.run(command, env=environment, capture_output=True, check=True, timeout=120)
     assert asked == []
 

@@ -18,17 +18,12 @@ from support.loopback import counting_server
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.overpass import read_area
 from roadgeo.sources.streams import read_lines
+from roadgeo.storage import vectors
 from roadgeo.storage.gdal import CONSENT
 
 LINE = {"type": "LineString", "coordinates": [[11.0, 48.0], [11.1, 48.1]]}
 AREA = {"type": "Polygon", "coordinates": [[[11, 48], [12, 48], [12, 49], [11, 48]]]}
 READERS = {"lines": lambda path: read_lines(path), "area": read_area}
-
-
-@pytest.fixture(autouse=True)
-def free_gdal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave all drivers to GDAL, as in a program that merely uses roadgeo."""
-    monkeypatch.delenv("GDAL_SKIP", raising=False)
 
 
 @pytest.fixture
@@ -97,14 +92,24 @@ def test_gml_does_not_fetch_its_schema(tmp_path, server):
     assert asked == []
 
 
-def test_drivers_are_back_afterwards(tmp_path):
-    before = pyogrio.list_drivers()
-    path = tmp_path / "roads.geojson"
+def test_drivers_are_back_afterwards(tmp_path, monkeypatch):
+    before, real = pyogrio.list_drivers(), pyogrio.list_layers
+    path, left = tmp_path / "roads.geojson", []
     path.write_text(geojson())
+    monkeypatch.setattr(pyogrio, "list_layers", lambda file: left.extend(pyogrio.list_drivers()) or real(file))
     assert len(read_lines(path).lines) == 1
+    assert {"GeoJSON"} <= {*left} <= vectors._DRIVERS
     assert pyogrio.list_drivers() == before
     assert pyogrio.get_gdal_config_option("GDAL_SKIP") is None
     assert pyogrio.get_gdal_config_option("GDAL_HTTP_PROXY") is None
+
+
+def test_drivers_of_other_builds_of_gdal_are_left_out_too(monkeypatch):
+    others = {"OGCAPI", "PostGISRaster", "ECW", "GDALG", "WMS", "WCS", "TileDB", "Zarr", "DAAS", "EEDA", "HTTP"}
+    monkeypatch.setattr(pyogrio, "list_drivers", lambda: dict.fromkeys([*others, "GPKG"], "r"))
+    monkeypatch.setattr(pyogrio.core, "_register_drivers", lambda: None)  # such a build
+    with vectors._few_drivers():
+        assert {*pyogrio.get_gdal_config_option("GDAL_SKIP").split(",")} == {*others, ""}
 
 
 def test_a_virtual_file_is_read_by_consent(tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from typing import Any
 from roadgeo._text import listed
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
+from roadgeo.storage.memory import bounded
 
 __all__ = ["TILE_STEP", "ModelCard", "channels_come_last", "read_card", "size_of"]
 
@@ -24,7 +25,6 @@ _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"n
 #: Free input sizes are made multiples of this, as encoders with five reductions ask for.
 TILE_STEP = 32
 _DEFAULT_TILE, _MAX_TILE, _MOST_LISTED = 512, 4096, 100
-_MAX_SIDECAR = 4 << 20
 
 #: Numbers that a model may take, and those that it may give as probabilities or logits; whole ones may be classes.
 _TAKEN = ("float32", "float16", "float64", "uint8")
@@ -235,9 +235,10 @@ def _classes(names: Any) -> dict[int, str]:
 
 def _read_sidecar(path: Path) -> dict[str, Any]:
     """Read the STAC item beside a model, if there is one and it describes a model."""
-    if not path.is_file() or path.stat().st_size > _MAX_SIDECAR:
+    if not path.is_file():
         return {}
-    document = json.loads(path.read_text(encoding="utf-8"))
+    with bounded(path, ModelError):
+        document = json.loads(path.read_text(encoding="utf-8"))
     properties = document.get("properties", {}) if isinstance(document, dict) else {}
     inputs, outputs = properties.get("mlm:input"), properties.get("mlm:output")
     if not inputs or not outputs:

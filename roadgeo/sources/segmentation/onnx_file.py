@@ -20,12 +20,15 @@ from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import ModelError, how_to_install
+from roadgeo.storage.memory import bounded
 from roadgeo.storage.protobuf import message_types
 
 __all__ = ["OnnxModel", "Port", "open_onnx"]
 
-_MAX_BYTES = 512 << 20
-_MAX_NODES = 20_000
+#: A packed model may unpack to this many bytes, and beyond them to a multiple of its size: numbers hardly shrink, and
+#: two bytes of a message take 60 of memory when they are looked at.
+_FREE, _TIMES = 16 << 20, 4
+_MAX_PARTS = 20_000  # operators, and tensors
 _MAX_MEMORY = 4 << 30  # bytes of all open models, with their working memory
 _MAX_SECONDS = 600.0  # of one tile
 
@@ -116,20 +119,21 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     Raises
     ------
     ModelError
-        onnxruntime is missing; the file is missing, too large, no ONNX, or holds what is listed above.
+        onnxruntime is missing; the file is missing, no ONNX, takes too much memory, or holds what is listed above.
     """
     if importlib.util.find_spec("onnxruntime") is None:
         raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {how_to_install('onnxruntime')}")
     name, file = os.fspath(path), Path(path)
     if not file.is_file():
         raise ModelError(f"{name}: no such model file; check the path")
+    most = _FREE + _TIMES * file.stat().st_size
     try:
         with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as opened:
-            content = opened.read(_MAX_BYTES + 1)
+            content = opened.read(most + 1)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise ModelError(f"{name}: cannot be unpacked ({error}); copy it again") from error
-    if len(content) > _MAX_BYTES:
-        raise ModelError(f"{name}: too large; expected a model of {_MAX_BYTES >> 20} MB at most")
+    if len(content) > most:
+        raise ModelError(f"{name}: unpacks to more than {_TIMES} times its size; unpack it yourself if you trust it")
     try:
         model = _require_network(content)
     except ModelError as error:
@@ -139,9 +143,12 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     }
     del model  # as large as the file
     try:
-        session = _open_session(content, threads)
+        with bounded(name, ModelError):
+            session = _open_session(content, threads)
         inputs, outputs = (tuple(map(_port, some)) for some in (session.get_inputs(), session.get_outputs()))
         metadata = dict(session.get_modelmeta().custom_metadata_map)
+    except ModelError:
+        raise
     except Exception as error:  # as above
         raise ModelError(
             f"{name}: cannot be loaded ({_reason(error)}); is it damaged, or made for a newer version?"
@@ -166,8 +173,8 @@ def _require_network(content: bytes) -> Any:
     (graph,) = model.graph
     if graph.sparse:
         raise ModelError("holds sparse tensors; expected dense ones: export it anew")
-    if len(graph.node) > _MAX_NODES:
-        raise ModelError(f"has more than {_MAX_NODES:,} operators; expected a network for segmentation")
+    if max(len(graph.node), len(graph.stored)) > _MAX_PARTS:
+        raise ModelError(f"has more than {_MAX_PARTS:,} operators or tensors; expected a network for segmentation")
     _require_numbers(graph.stored)
     for node in graph.node:
         _require_plain(node)
