@@ -62,7 +62,7 @@ _ETC = (
     *("ld.so.conf.d", "ld.so.preload", "locale.alias", "localtime", "mime.types", "nsswitch.conf", "os-release", "pki"),
     *("protocols", "resolv.conf", "services", "ssl", "timezone"),
 )
-_DEVICES = ("null", "zero", "full", "random", "urandom", "tty", "pts")
+_DEVICES = ("null", "zero", "full", "random", "urandom")
 #: Variables that name data of libraries.
 _DATA = (
     *("PROJ_DATA", "PROJ_LIB", "GDAL_DATA", "GDAL_DRIVER_PATH", "LD_LIBRARY_PATH"),

@@ -121,6 +121,21 @@ def test_a_virtual_raster_reads_what_it_names_where_that_is_allowed(porto: Path,
     assert roadgeo(tmp_path, "locate", "mask.vrt", "-r", str(porto), "--allow", "tiles").returncode == 0
 
 
+def test_nothing_is_read_of_the_standard_input(tmp_path: Path) -> None:
+    """Its end is waited for: a pipe is no file, to which the fence has rules."""
+    MAPS[0](tmp_path, naming("/dev/stdin")[0])
+    virtual(tmp_path, "/proc/self/fd/0")
+    reading, writing = os.pipe()
+    try:
+        for command in (["index", "--roads", "roads.geojson", "--out", "made.gpkg"], ["vectorize", "mask.vrt"]):
+            program = [sys.executable, "-m", "roadgeo", *command]
+            how = {"cwd": tmp_path, "env": surroundings(tmp_path), "stdin": reading, "timeout": 60}
+            subprocess.run(program, **how, capture_output=True, check=False)
+    finally:
+        os.close(reading)
+        os.close(writing)
+
+
 VIRTUAL = """
 import sys
 import roadgeo
