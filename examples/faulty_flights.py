@@ -40,7 +40,7 @@ VIEWS = FlightOptions(
 )
 #: Frames are wrong beyond this number of standard deviations; a motion is, beyond this number of pixels.
 WRONG_SIGMAS, WRONG_PX = 5.0, 50.0
-#: Frames at the end of a flight, half of which must lie within so many metres of the truth for it to be found again.
+#: Frames at the end of a flight, and the distance, metres, within which half of them are found again.
 LAST, RIGHT_M = 6, 50.0
 
 

@@ -45,7 +45,7 @@ def enter_fence(command: str, given: Mapping[str, Any], allowed: Iterable[str]) 
             )
             echo(said, err=True)
         return
-    if not os.isatty(0):  # a file may name what is open already: who waits there for more has no end
+    if not os.isatty(0):  # a file may name the standard input: who waits there for more has no end
         with Path(os.devnull).open("rb") as nothing:
             os.dup2(nothing.fileno(), 0)
     fence_of(command, given, allowed).enter()

@@ -128,7 +128,7 @@ class Evidence:
     def compared_with(self, matrix: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
         """Return a function of another place that returns its log10 L, and the lead of this place over it (log10).
 
-        The lead is measured piece by piece, and is no more than what this place explains beyond the other, by the
+        The lead is measured piece by piece, and is no more than the likelihood by which this place is ahead, by the
         query's roads or by all: two places that are equal may differ by little everywhere. Every other place is
         compared with the deviation and the share of false roads that explain this place best, and by the query's roads
         alone: the best of many wrong places lies where the map shows few roads that the query lacks, and all other

@@ -180,7 +180,7 @@ class Rivals:
         return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
 
     def _among_equals(self, part: Search[Place]) -> Place | None:
-        """Compare the likeliest place of a part; where it leads, also with what its own tuples fit elsewhere."""
+        """Compare the likeliest place of a part; where it leads, also with the places that its own tuples fit."""
         place = self._by_roads(part)
         if place is None or place.score < self.needed:
             return place

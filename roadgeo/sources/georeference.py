@@ -61,7 +61,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
 
 
 class Stated(NamedTuple):
-    """What a picture states of its pixels and its place.
+    """The shape of its pixels and the place that a picture states.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Stated(NamedTuple):
 
 
 def read_stated(path: str | os.PathLike[str]) -> Stated:
-    """Read what a raster, or a file beside it, states."""
+    """Read the statements of a raster, or of a file beside it."""
     georeference = _stated(path)
     middle = (np.nan, np.nan) if georeference is None else georeference.middle()
     place = middle if np.isfinite(middle).all() else read_position(path)

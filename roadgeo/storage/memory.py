@@ -64,7 +64,7 @@ def bounded(
         _set_bound(thread, None)
 
 
-#: The bound of each thread that reads: what the process held before, and how much more it may take, bytes.
+#: The bound of each thread that reads: bytes that the process held before, and how many more it may take.
 _bounds: dict[int, tuple[int, int]] = {}
 _LOCK = threading.Lock()
 _UNLIMITED = 1 << 64  # -1 stands for no limit
