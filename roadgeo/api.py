@@ -273,17 +273,16 @@ def locate(
     options = _with_hints(options or LocateOptions(), hints, mask)
     if isinstance(take, int) and take < 1:
         raise ValueError(f"take={take!r}: places are counted from 1")
+    given = mask if isinstance(mask, RoadMask) else read_picture(mask)
     references = _open(reference)
     meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
         near = hints.get("near")
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
-    picture = None
-    if isinstance(mask, RoadMask):
-        sighting = Sighting(locate_mask(mask, references, options), mask)
+    if isinstance(given, RoadMask):
+        sighting = Sighting(locate_mask(given, references, options), given)
     else:
-        picture = read_picture(mask)
-        sighting = locate_query(picture, references, options, ReadOptions(**pixels_of(mask)))
+        sighting = locate_query(given, references, options, ReadOptions(**pixels_of(mask)))
     if take is not None:
         sighting = sighting.answering(take_place(sighting.location, take, options))
     changed = changed_options(replace(options, truths=(), threads=1), LocateOptions())
@@ -291,7 +290,7 @@ def locate(
     answer = {field.name: getattr(sighting.location, field.name) for field in fields(Location)}
     answer["reason"] = as_keywords(sighting.location.reason)
     indexes = tuple(item.index_of(sighting.location) for item in references)
-    picture = picture if sighting.of_photograph else None
+    picture = None if isinstance(given, RoadMask) or not sighting.of_photograph else given
     photo, pixels = (picture, None) if isinstance(picture, str) else (None, picture)
     return Answer(**{**answer, **origin}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
 
