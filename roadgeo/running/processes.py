@@ -38,8 +38,6 @@ _PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sour
 
 #: Time in which a process that is to end, or whose parent is gone, removes half-written files.
 _GRACE_S = 5.0
-#: Time within which a parent whose pipe is closed is seen to be gone.
-_LAST_S = 0.2
 #: Time to become ready.
 _START_S = 120.0
 #: Interval of checks whether somebody still waits.
@@ -261,7 +259,7 @@ def _serve(
                 task = pipe.recv()
                 pipe.send((kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task))
         parent = multiprocessing.parent_process()  # where it is gone, this thread must not end what the other cleans
-        if clean is not None and parent is not None and multiprocessing.connection.wait([parent.sentinel], _LAST_S):
+        if clean is not None and parent is not None and multiprocessing.connection.wait([parent.sentinel], _GRACE_S):
             clean()
     except SystemExit:  # the task has cleaned up
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
