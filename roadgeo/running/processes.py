@@ -258,9 +258,8 @@ def _serve(
             while True:
                 task = pipe.recv()
                 pipe.send((kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task))
-        parent = multiprocessing.parent_process()  # where it is gone, this thread must not end what the other cleans
-        if clean is not None and parent is not None and multiprocessing.connection.wait([parent.sentinel], _GRACE_S):
-            clean()
+        if clean is not None:  # the thread that watches the parent is outside the fence: it cleans, and ends this one
+            time.sleep(_GRACE_S)
     except SystemExit:  # the task has cleaned up
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
         remove_own()
