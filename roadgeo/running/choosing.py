@@ -33,6 +33,9 @@ __all__ = ["place_by_points", "take_again", "take_place"]
 
 #: Points that spread less across than this share of what they spread along say nothing of one direction.
 _LINE = 0.03
+#: So many points determine the map that is fitted to them: an affine map three, a homography four.
+_EXACT = 4
+_UNCHECKED = ": nothing checks them, for so few fit any picture exactly; give five or more"
 
 
 def take_place(location: Location, taken: Taken, options: LocateOptions | None = None) -> Location:
@@ -98,6 +101,7 @@ def place_by_points(location: Location, points: FloatArray, references: Sequence
     if not (matrix.ahead(Frame(*size).corners).all() and np.all(east * np.roll(north, -1) < north * np.roll(east, -1))):
         raise MaskError("no camera above the ground sees the points so; has one been exchanged for another?")
     off_m = float(np.sqrt(np.mean(np.sum((matrix.everywhere(pixels) - xy) ** 2, axis=1))))
+    fit = f"; they are off by {off_m:.1f} m (root mean square)" if len(points) > _EXACT else _UNCHECKED
     lon, lat = lonlat.mean(axis=0).tolist()
     index = min(
         (index for reference in references for index in reference.indexes_at([(lon, lat)])),
@@ -109,7 +113,7 @@ def place_by_points(location: Location, points: FloatArray, references: Sequence
     return replace(
         location,
         status="chosen",
-        reason=f"placed by {len(points)} points, as given; they are off by {off_m:.1f} m (root mean square)",
+        reason=f"placed by {len(points)} points, as given{fit}",
         reason_code=Reason.CHOSEN,
         places=(place,),
         reference=name,

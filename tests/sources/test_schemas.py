@@ -251,18 +251,22 @@ def test_lines_that_are_taken_without_a_kind_are_told(tmp_path, caplog):
     assert "2 of 3 lines have no kind of road; they are taken" in caplog.text
 
 
+def overture(folder, container, lines, rules):
+    """Write segments as Overture does, with rules of flags, and return what to read; a frame is given as it is."""
+    columns = {"class": ["secondary"] * len(lines), "subtype": ["road"] * len(lines), "road_flags": rules}
+    source = folder / f"a.{container}"
+    if container in ("frame", "parquet"):
+        table = gpd.GeoDataFrame(columns, geometry=lines, crs=4326)
+        table.to_parquet(folder / "a.parquet")
+        return table if container == "frame" else source
+    return write_vector(source, lines, **columns | {"road_flags": [rule and json.dumps(rule) for rule in rules]})
+
+
 @pytest.mark.parametrize("container", ["frame", "parquet", "geojson", "gpkg"])
 @pytest.mark.parametrize("between", [[None, 0.4], [0.4, 0.0], [-0.1, 0.4], [0.6, None], [0.6, 2.0]])
 def test_a_part_of_a_segment_may_lack_an_end(tmp_path, container, between):
     line, rule = shapely.LineString([(0, 0), (0, 0.01)]), [{"values": ["is_tunnel"], "between": between}]
-    columns = {"class": ["secondary"], "subtype": ["road"], "road_flags": [rule]}
-    source = tmp_path / f"a.{container}"
-    if container in ("frame", "parquet"):
-        table = gpd.GeoDataFrame(columns, geometry=[line], crs=4326)
-        table.to_parquet(tmp_path / "a.parquet")
-        source = table if container == "frame" else source
-    else:
-        write_vector(source, [line], **columns | {"road_flags": [json.dumps(rule)]})
+    source = overture(tmp_path, container, [line], [rule])
     assert shapely.length(choose_roads(source).lines).sum() == pytest.approx(0.6 * 1105.7, rel=1e-2)
 
 
@@ -271,14 +275,7 @@ def test_a_part_of_a_segment_may_lack_an_end(tmp_path, container, between):
 def test_a_tunnel_may_be_a_link_too(tmp_path, container, between):
     lines = [shapely.LineString([(k / 100, 0), (k / 100, 0.01)]) for k in range(2)]
     rule = [{"values": ["is_link", "is_tunnel"], "between": between}]
-    columns = {"class": ["secondary"] * 2, "subtype": ["road"] * 2, "road_flags": [rule, None]}
-    source = tmp_path / f"a.{container}"
-    if container in ("frame", "parquet"):
-        table = gpd.GeoDataFrame(columns, geometry=lines, crs=4326)
-        table.to_parquet(tmp_path / "a.parquet")
-        source = table if container == "frame" else source
-    else:
-        write_vector(source, lines, **columns | {"road_flags": [json.dumps(rule), None]})
+    source = overture(tmp_path, container, lines, [rule, None])
     seen = 1.0 if between is None else 1.5
     assert shapely.length(choose_roads(source).lines).sum() == pytest.approx(seen * 1105.7, rel=1e-2)
 
@@ -328,14 +325,7 @@ def test_a_part_of_a_segment_that_is_not_built_is_cut_out(tmp_path, container, t
         {"values": ["is_under_construction"], "between": [0.2, 0.5]},
         {"values": ["is_bridge"], "between": [0.7, 1]},
     ]
-    columns = {"class": ["secondary"], "subtype": ["road"], "road_flags": [rule]}
-    source = tmp_path / f"a.{container}"
-    if container in ("frame", "parquet"):
-        table = gpd.GeoDataFrame(columns, geometry=[line], crs=4326)
-        table.to_parquet(tmp_path / "a.parquet")
-        source = table if container == "frame" else source
-    else:
-        write_vector(source, [line], **columns | {"road_flags": [json.dumps(rule)]})
+    source = overture(tmp_path, container, [line], [rule])
     assert shapely.length(choose_roads(source, tunnels=tunnels).lines).sum() == pytest.approx(0.7 * 1105.7, rel=1e-2)
 
 
@@ -349,15 +339,8 @@ def test_a_part_of_a_segment_in_a_tunnel_is_cut_out(tmp_path, container):
         [{"values": ["is_link"], "between": [0.0, 1.0]}],
         None,
     ]
-    columns = {"class": ["secondary"] * 4, "subtype": ["road"] * 4, "road_flags": rules}
     shapes = [shapely.affinity.translate(line, k / 100) for k in range(4)]
-    if container in ("frame", "parquet"):
-        table = gpd.GeoDataFrame(columns, geometry=shapes, crs=4326)
-        table.to_parquet(tmp_path / "a.parquet")
-        source = table if container == "frame" else tmp_path / "a.parquet"
-    else:
-        columns["road_flags"] = [rule and json.dumps(rule) for rule in rules]
-        source = write_vector(tmp_path / f"a.{container}", shapes, **columns)
+    source = overture(tmp_path, container, shapes, rules)
     found = choose_roads(source)
     lengths = shapely.length(found.lines) / shapely.length(choose_roads(source, tunnels=True).lines).max()
     assert sorted(lengths.tolist()) == pytest.approx([0.2, 0.5, 1.0, 1.0], abs=1e-3)

@@ -330,7 +330,10 @@ class PlaceByPoints(RoadgeoAlgorithm):
     OPTIONS = given.POINTS
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
-        "RMS": (QgsProcessingOutputNumber, "Root mean square of the residuals, map units"),
+        "RMS": (
+            QgsProcessingOutputNumber,
+            "Root mean square of the residuals, map units; 0 of four points, which fit any picture",
+        ),
     }
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:

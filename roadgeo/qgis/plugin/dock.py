@@ -334,6 +334,8 @@ class MatchDock(QDockWidget):
             text = "Click a spot on the picture or on the map; then drag the point to where it belongs."
         elif self.fitted.matrix is None:
             text += f" are on: a fit needs {FEWEST}, not on one line." if self.picture else ""
+        elif len(used) == FEWEST:
+            text += f": nothing checks them, for {FEWEST} fit any picture exactly"
         else:
             text += f", {rms(used):.2f} {'m' if self._measure() is not None else 'map units'} root mean square"
         if self.picture:
