@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from html import escape
@@ -19,22 +20,37 @@ from roadgeo.roads.graph import RoadGraph
 if TYPE_CHECKING:
     import geopandas as gpd
 
-__all__ = ["ERROR_RATES", "SCHEMA", "Content", "ErrorRate", "Location", "Reason", "Seconds", "Spent", "Stats", "Status"]
+__all__ = [
+    "ERROR_RATES",
+    "SCHEMA",
+    "Content",
+    "ErrorRate",
+    "Kind",
+    "Location",
+    "Reason",
+    "Seconds",
+    "Spent",
+    "Stats",
+    "Status",
+]
 
 SCHEMA = "roadgeo.location/1"
 
 Status = Literal["located", "ambiguous", "not_located", "chosen", "error"]
 
+#: What a place rests on: a photograph; roads and hints; the probability of road at each pixel; or roads alone.
+Kind = Literal["photograph", "hints", "soft mask", "mask"]
+
 
 class ErrorRate(NamedTuple):
-    """How many places were wrong of those with scores like this one: counted, four in five masks without a place.
+    """How many places were wrong of those with scores like this one: counted among more queries without a place.
 
     Attributes
     ----------
     score : float
         `log10_odds` from here to the next band's.
     reported, wrong : int
-        Places of such scores that `examples/trust` saw reported, and how many of them were wrong.
+        Places of such scores that were reported in `examples`, and how many of them were wrong.
     at_most : float
         The share that is wrong, with 95 % confidence (Clopper and Pearson, Biometrika 26, 1934; its upper end).
     """
@@ -44,14 +60,25 @@ class ErrorRate(NamedTuple):
     wrong: int
     at_most: float
 
+    def __str__(self) -> str:
+        """Say it: "of such places at most 1 in 30 is wrong"."""
+        n = 1.0 / self.at_most
+        digits = max(math.floor(math.log10(n)) - 1, 0)
+        return f"of such places at most 1 in {math.floor(n / 10**digits) * 10**digits:,} is wrong"
 
-#: By bands of the score, from the threshold on; a test counts them again in `examples/trust/results`.
-ERROR_RATES = (
-    ErrorRate(3.5, 19, 2, 0.331),
-    ErrorRate(5.0, 43, 3, 0.191),
-    ErrorRate(8.0, 165, 1, 0.0333),
-    ErrorRate(15.0, 1941, 0, 0.0019),
-)
+
+#: Of each kind, by bands of the score, from the threshold on; a test counts them again in the results of `examples`.
+ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
+    "mask": (
+        ErrorRate(3.5, 19, 2, 0.331),
+        ErrorRate(5.0, 43, 3, 0.191),
+        ErrorRate(8.0, 165, 1, 0.0333),
+        ErrorRate(15.0, 1941, 0, 0.0019),
+    ),
+    "soft mask": (),
+    "hints": (),
+    "photograph": (),
+}
 
 
 @dataclass(frozen=True)
@@ -119,6 +146,8 @@ class Content:
         For roads that came as lines: their coordinates to pixels of the mask that was drawn from them.
     stated : (lon, lat) or None
         Its middle by its own georeference.
+    kind : Kind
+        What places rest on.
     """
 
     size: tuple[int, int]
@@ -127,6 +156,7 @@ class Content:
     part: str = ""
     lines_to_pixels: FloatArray | None = None
     stated: tuple[float, float] | None = None
+    kind: Kind = "mask"
 
 
 @dataclass(frozen=True, repr=False)
@@ -306,9 +336,11 @@ class Location:
 
     @property
     def error_rate(self) -> ErrorRate | None:
-        """How often places of such scores were wrong; None where none is reported, or with a lower score than usual."""
-        score = self.log10_odds if self.located else None
-        return None if score is None else next((rate for rate in reversed(ERROR_RATES) if score >= rate.score), None)
+        """How often such places were wrong; None where none is reported, or with a lower score than usual."""
+        if not self.located or self.content is None or self.log10_odds is None:
+            return None
+        score, rates = self.log10_odds, ERROR_RATES[self.content.kind]
+        return next((rate for rate in reversed(rates) if score >= rate.score), None)
 
     @cached_property
     def stated_offset_m(self) -> float | None:
@@ -483,6 +515,8 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Camera):
         return value.to_dict()
-    if isinstance(value, CenterError | ErrorRate):
+    if isinstance(value, ErrorRate):
+        return {**value._asdict(), "said": str(value)}
+    if isinstance(value, CenterError):
         return value._asdict()
     return list(value) if isinstance(value, tuple) else value

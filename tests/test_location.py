@@ -73,7 +73,7 @@ def test_a_location_says_the_answer_in_one_line():
 def test_a_place_tells_how_often_such_places_were_wrong(location, score):
     rate = location.error_rate
     assert (None if rate is None else rate.score) == score
-    assert location.to_dict()["error_rate"] == (None if rate is None else rate._asdict())
+    assert location.to_dict()["error_rate"] == (None if rate is None else {**rate._asdict(), "said": str(rate)})
 
 
 def test_pixels_go_to_the_map_and_back():

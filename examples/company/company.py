@@ -4,7 +4,7 @@
     python examples/company/company.py shards         masks of five cities, on the atlas in shards
     python examples/company/company.py told           frames with a circle of 40 m on the wrong blocks, and on the right
     python examples/company/company.py twice          maps that hold a district twice
-    python examples/company/company.py mirrored       soft masks of grids, mirrored: they have no place
+    python examples/company/company.py soft           soft masks of grids, also mirrored: those have no place
     python examples/company/company.py table          count the results again
 
 Every search is a row in results/NAME.csv; a run that was stopped goes on where it was. Maps are built once, in --maps.
@@ -67,7 +67,7 @@ class Case:
     """A mask to be located on a map; `city`, `kind` and `k` name it.
 
     It is the `number`-th mask of a kind of `examples/bench.py`, drawn of `roads`. `circle` is "true" or "false" where
-    scale, heading and a circle are given. A mirrored mask is soft, as a network draws it.
+    scale, heading and a circle are given. A soft mask is drawn as a network draws it.
     """
 
     city: str
@@ -79,6 +79,7 @@ class Case:
     number: int
     circle: str = ""
     mirrored: bool = False
+    soft: bool = False
 
     @property
     def key(self) -> dict[str, Any]:
@@ -91,7 +92,7 @@ class Case:
             query = simulate_query(landscape_of(self.roads), options, self.number)
         except RoadSourceError:
             return None
-        return replace(query, mask=soften(query.mask, np.random.default_rng(self.k))) if self.mirrored else query
+        return replace(query, mask=soften(query.mask, np.random.default_rng(self.k))) if self.soft else query
 
     def hints(self, query: SimulatedQuery) -> dict[str, Any]:
         """Return the scale within 7 %, the heading within 8 degrees, and a circle; or nothing."""
@@ -184,17 +185,18 @@ def drawn_map(roads: Path, side: int) -> DrawnMap:
     return DrawnMap(shapely.transform(landscape.lines, landscape.plane.to_crs), side)
 
 
-# --- mirrored masks ---------------------------------------------------------------------------------------------------
+# --- soft masks -------------------------------------------------------------------------------------------------------
 
 
-def mirrored(setting: Setting) -> Iterator[Case]:
-    """Frames whose blocks may nearly equal their mirror image."""
+def soft(setting: Setting) -> Iterator[Case]:
+    """Frames whose blocks may nearly equal their mirror image, and their mirror images."""
     for k in range(setting.count):
         for city in setting.cities or ALIKE:
             roads = setting.roads(city)
             reference = setting.build(roads, f"{roads.stem}.gpkg")
             for frame in ("frame512", "frame800"):
-                yield Case(city, frame, k, reference, roads, frame, k, mirrored=True)
+                yield Case(city, frame, k, reference, roads, frame, k, soft=True)
+                yield Case(city, f"{frame}, mirrored", k, reference, roads, frame, k, mirrored=True, soft=True)
 
 
 # --- districts that stand twice ---------------------------------------------------------------------------------------
@@ -292,7 +294,7 @@ def count(path: Path) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    sets = {"shards": shards, "told": told, "twice": twice, "mirrored": mirrored}
+    sets = {"shards": shards, "told": told, "twice": twice, "soft": soft}
     parser.add_argument("what", choices=[*sets, "table"])
     parser.add_argument("-n", "--count", type=int, default=6, help="masks of each kind and city; `twice`: maps of each")
     parser.add_argument("--seed", type=int, default=72)

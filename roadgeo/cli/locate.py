@@ -259,6 +259,8 @@ def describe(outcome: Outcome) -> str:
     else:
         where = format_lonlat(answer["center"]["lon"], answer["center"]["lat"])
         text = f"{query}: {status} at {where} on {visible(answer['reference'])}: {visible(answer['reason'])}"
+    if answer.get("error_rate"):
+        text += f"; {answer['error_rate']['said']}"
     if answer.get("part_read"):
         text += f"\n  read {visible(answer['part_read'])}"
     if answer.get("stated_offset_m") is not None:

@@ -17,14 +17,14 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.placement import Matches, Placement
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.geometry.similarity import find_similarity
-from roadgeo.location import Content, Location, Reason, Spent, Stats
+from roadgeo.location import Content, Kind, Location, Reason, Spent, Stats
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.methods import N_PLACES, Searched
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query, Scene
-from roadgeo.matching.veto import broken_hints
+from roadgeo.matching.veto import broken_hints, without_hints
 
 __all__ = ["away", "decide", "georeference", "match_again", "searched_within"]
 
@@ -62,7 +62,7 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
     otherwise                                                    located
     ===========================================================  ===========================
     """
-    location = _describe_work(query, searched)
+    location = _describe_work(query, searched, options)
     if options.method == "pair":
         return _decide_pairs(location, query, searched, options)
     # The best place of all references, and the others.
@@ -93,7 +93,7 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
     return replace(location, status="located", reason=reason, reason_code=Reason.LOCATED)
 
 
-def _describe_work(query: Query, searched: Sequence[Searched]) -> Location:
+def _describe_work(query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
     """Return the fields that do not depend on the answer."""
     stats = [result.stats for result in searched]
     work = Stats(
@@ -105,7 +105,9 @@ def _describe_work(query: Query, searched: Sequence[Searched]) -> Location:
     )
     match_s, refine_s = sum(result.match_s for result in searched), sum(result.refine_s for result in searched)
     seconds = replace(query.seconds, match=match_s, refine=refine_s)
-    content = Content(query.scene.size, query.graph, query.scene.intersections.xy)
+    soft: Kind = "mask" if query.scene.probability is None else "soft mask"
+    kind: Kind = soft if without_hints(options) is None else "hints"
+    content = Content(query.scene.size, query.graph, query.scene.intersections.xy, kind=kind)
     return Location(query.name, "not_located", "", content=content, spent=Spent(seconds, work, _ended_by(searched)))
 
 

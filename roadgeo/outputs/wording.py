@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["format_lonlat", "write_distance", "write_lead", "write_sigma", "write_times"]
-
-#: From these log10 on a factor is written as a power of ten, and below as "alike".
-_LARGE, _ALIKE = 6.0, 0.2
+__all__ = ["format_lonlat", "write_distance", "write_sigma"]
 
 
 def format_lonlat(lon: float, lat: float) -> str:
@@ -27,16 +24,3 @@ def write_distance(metres: float) -> str:
 def write_sigma(metres: float) -> str:
     """Write a standard deviation: ± 1.3 m; "" where it is not known."""
     return f"± {write_distance(metres)}" if math.isfinite(metres) else ""
-
-
-def write_times(log10: float) -> str:
-    """Write a factor by its log10, with two digits at most: 2.5 times, 30 times, 3,200 times, 10^13 times."""
-    if log10 >= _LARGE:
-        return f"10^{log10:.0f} times"
-    factor = 10.0**log10
-    return f"{factor:.1f} times" if factor < 9.95 else f"{round(factor, 1 - math.floor(log10)):,.0f} times"
-
-
-def write_lead(log10: float) -> str:
-    """Compare another place with the best by the log10 by which the best is likelier: "3,200 times less likely"."""
-    return "about as likely" if log10 < _ALIKE else f"{write_times(log10)} less likely"

@@ -145,19 +145,20 @@ def take_again(
         The image cannot be read.
     """
     location = take_place(answer, taken, options)
-    place, of_photograph = location.places[0], is_ours(kept)
-    first = read_roads(str(kept) if of_photograph else image, (place.gsd_m, place.gsd_m), reading)
+    place, is_kept = location.places[0], is_ours(kept)
+    first = read_roads(str(kept) if is_kept else image, (place.gsd_m, place.gsd_m), reading)
+    content = Content(place.size, kind="photograph" if is_kept or first.of_photograph else "mask")
     height_width = place.size[::-1]
     mask = first.mask if first.mask.shape == height_width else resampled(first.mask, height_width).mask
     mask = replace(mask, name=image)
     try:
         scene, graph = trace_query(mask)
     except MaskError:  # the photograph shows hardly a road
-        return Sighting(location, mask, of_photograph=of_photograph or first.of_photograph)
-    content = Content(place.size, graph, scene.intersections.xy)
+        return Sighting(replace(location, content=content), mask)
+    content = replace(content, graph=graph, xy=scene.intersections.xy)
     place = _matched(place, scene, [reference.index_of(location) for reference in references])
     location = replace(location, content=content, places=(place, *location.places[1:]))
-    return Sighting(location, mask, of_photograph=of_photograph or first.of_photograph)
+    return Sighting(location, mask)
 
 
 def _matched(place: Placement, scene: Scene, indexes: Sequence[ReferenceIndex]) -> Placement:

@@ -61,7 +61,11 @@ class Sighting:
     mask: RoadMask
     explanation: Explanation | None = None
     probability: ProbabilityMap | None = None
-    of_photograph: bool = False
+
+    @property
+    def of_photograph(self) -> bool:
+        """Whether the image is a photograph."""
+        return self.location.content is not None and self.location.content.kind == "photograph"
 
     def answering(self, location: Location) -> Sighting:
         """Return it with another answer."""

@@ -149,7 +149,7 @@ def _locate(
         if not isinstance(query.path, str):
             reason = sighting.location.reason.replace(file, _ARRAY)
             sighting = sighting.answering(replace(sighting.location, query=_ARRAY, reason=reason))
-    return replace(sighting, of_photograph=True)
+    return sighting.showing(kind="photograph")
 
 
 @dataclass(frozen=True)

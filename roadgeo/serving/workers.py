@@ -248,7 +248,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     sighting = None if taken is None and points is None else read_sighting(Path(request.path))
     if sighting is None:
         sighting = locate_query(image, references, options, query, how=search, say=tell)
-        sighting = replace(sighting, of_photograph=sighting.of_photograph or has_probability)
+        sighting = sighting.showing(kind="photograph") if has_probability else sighting
     if taken is not None:
         sighting = sighting.answering(take_place(sighting.location, taken, options))
     if points is not None:

@@ -652,7 +652,7 @@ def test_an_image_is_searched_again_with_other_hints():
 @pytest.mark.parametrize("name", ["picture.jpg", "seen.tif", "warped.webp", "view.json.png"])
 def test_an_image_stays_as_it_was_sent_whatever_it_is_called(name, town, monkeypatch):
     def locate_query(path, *_, **__):
-        return Sighting(REFUSED, RoadMask(np.zeros((40, 60), bool)), probability=SEEN_ROADS, of_photograph=True)
+        return Sighting(REFUSED, RoadMask(np.zeros((40, 60), bool)), probability=SEEN_ROADS).showing(kind="photograph")
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
     network, index = town

@@ -202,7 +202,7 @@ def test_the_roads_of_a_photograph_are_found_once(tmp_path, town, monkeypatch):
         asked_of.append(Path(path).name)
         seen = ProbabilityMap(np.full((40, 60), 9, np.uint8))
         refused = Location("photo.png", "not_located", "hardly a road", content=Content((60, 40)))
-        return Sighting(refused, RoadMask(np.zeros((40, 60), bool)), probability=seen, of_photograph=True)
+        return Sighting(refused, RoadMask(np.zeros((40, 60), bool)), probability=seen).showing(kind="photograph")
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
     network, index = town

@@ -35,7 +35,7 @@ from roadgeo.outputs.drawing.views import (
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.report.viewer import draw_viewer
 from roadgeo.outputs.subject import Subject
-from roadgeo.outputs.wording import format_lonlat, write_distance, write_lead, write_sigma
+from roadgeo.outputs.wording import format_lonlat, write_distance, write_sigma
 
 __all__ = [
     "STATUS", "label_values", "name_owners", "render_page", "render_report", "section", "table", "write_report",
@@ -232,7 +232,8 @@ def _explain(subject: Subject) -> str:
     """Return the meaning of the answer, and the advice where there is no place: HTML."""
     location = subject.location
     if location.status == "located":
-        texts = [_rival(location)]
+        rate = location.error_rate
+        texts = [_rival(location), "" if rate is None else _sentence(str(rate))]
     elif location.status == "chosen":
         texts = [
             "Nothing stands out here: this is a place that you chose. How often such places are wrong is not known."
@@ -293,7 +294,8 @@ def _rival(location: Location) -> str:
     azimuth, _, apart = Geod(ellps="WGS84").inv(center.lon, center.lat, other.center.lon, other.center.lat)
     way = f"{write_distance(apart)} to the {_WINDS[round(azimuth / 45.0) % 8]}"
     way += "" if other.reference == location.reference else f", on the map {in_html(other.reference)}"
-    return f"The best other place lies {way}, {write_lead(location.log10_odds)}: {_link(other.center)}"
+    behind = max(location.log10_odds, 0.0)
+    return f"The best other place lies {way}, {behind:.1f} behind by the score: {_link(other.center)}"
 
 
 def _sentence(text: str) -> str:

@@ -114,7 +114,7 @@ async function finish(entry, job) {
   try {
     const { location } = await ask(`${entry.base}/results`);
     const seen = await ask(`${entry.base}/view.json`).catch(() => null);  // there was no room for it on the server's disk
-    update(entry, { document: location, view: seen, status: location.status, message: location.reason });
+    update(entry, { document: location, view: seen, status: location.status, message: [location.reason, ...(location.error_rate ? [location.error_rate.said] : [])].join("; ") });
   } catch (problem) {
     update(entry, { status: "failed", message: problem.message });
   }
