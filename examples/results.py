@@ -47,8 +47,14 @@ def share(hits: int, of: int) -> str:
     """Return "15 of 18 (59 to 96 %)": the 95 % interval of Clopper and Pearson (Biometrika 26, 1934)."""
     if of == 0:
         return "-"
-    bounds = binomtest(hits, of).proportion_ci(method="exact")
-    return f"{hits} of {of} ({100 * bounds.low:.0f} to {100 * bounds.high:.0f} %)"
+    low, high = interval(hits, of)
+    return f"{hits} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def interval(hits: int, of: int) -> tuple[float, float]:
+    """Return the 95 % interval of Clopper and Pearson for a share."""
+    bounds = binomtest(hits, of).proportion_ci(method="exact") if of else (0.0, 1.0)
+    return bounds[0], bounds[1]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

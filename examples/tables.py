@@ -1,9 +1,9 @@
 """Write the tables of docs/how-well.md from the results that are kept: python examples/tables.py.
 
 `results/bench.json` is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one
-counts. The bands of the score are the same as in `error_rate` of a result. The other tables count the searches that
-`examples/trust`, `examples/photographs`, `examples/company` and `examples/peers` keep in their `results`. `--check`
-writes nothing, and fails if a table would change.
+counts. The other tables count the searches that `examples/trust`, `examples/photographs`, `examples/company` and
+`examples/peers` keep in their `results`. Bands of the score are those of `roadgeo.location.ERROR_RATES`, which a test
+holds against the table. `--check` writes nothing, and fails if a table would change.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import re
 import sys
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ import join  # noqa: E402
 import photographs  # noqa: E402
 import results  # noqa: E402
 
-from roadgeo.location import ERROR_RATES  # noqa: E402
+from roadgeo.location import ERROR_RATES, Kind  # noqa: E402
 
 PAGE = EXAMPLES.parent / "docs" / "how-well.md"
 BENCH = EXAMPLES / "results" / "bench.json"
@@ -41,7 +42,7 @@ WORN = {
     "torn": "torn: 30 to 50 % gone, 10 to 40 % false",
     "outdated": "outdated: mild, 20 to 40 % of the streets unknown to the map",
 }
-COMPANY = ("shards", "told", "twice", "mirrored")
+COMPANY = ("shards", "told", "twice", "soft")
 NAMES = {
     "base": "usual: 10 % gone, 4 % false, ragged edges",
     "clean": "clean: level, nothing gone or false, smooth edges",
@@ -97,13 +98,30 @@ def worn_table() -> Iterator[str]:
 
 
 def trust_table() -> Iterator[str]:
-    """Yield the lines of the table of scores."""
-    yield "| score | reported | wrong |"
-    yield "|---|---|---|"
-    for rate, above in zip(ERROR_RATES, [*ERROR_RATES[1:], None], strict=True):
-        band = f"{rate.score:g} and more" if above is None else f"{rate.score:g} to {above.score:g}"
-        at_most = f"{rate.wrong} (at most {100 * rate.at_most:.2g} %)" if rate.reported else "-"
-        yield f"| {band} | {rate.reported:,} | {at_most} |"
+    """Yield the lines of the table of scores: of each kind of query, how many places were reported, how many wrong."""
+    yield "| query | score | reported | wrong |"
+    yield "|---|---|---|---|"
+    for kind, rates in ERROR_RATES.items():
+        searches = reported(kind)
+        for rate, above in zip(rates, [*rates[1:], None], strict=True):
+            band = f"{rate.score:g} and more" if above is None else f"{rate.score:g} to {above.score:g}"
+            inside = [right for score, right in searches if rate.score <= score < (above.score if above else math.inf)]
+            wrong = inside.count(False)
+            at_most = 100 * results.interval(wrong, len(inside))[1]
+            yield f"| {kind} | {band} | {len(inside):,} | {wrong} (at most {at_most:.3g} %) |"
+
+
+def reported(kind: Kind) -> list[tuple[float, bool]]:
+    """Return the score of each place of that kind that was reported, and whether it was right."""
+    if kind == "mask":
+        rows = [row for path in sorted(SEARCHES.glob("*.csv")) for row in results.read(path)]
+        return [(float(row["score"]), row["right"] == "1") for row in rows if float(row["score"]) >= NEEDED]
+    if kind == "photograph":
+        kept = results.read(EXAMPLES / "photographs" / "results" / "photographs.csv")
+        rows = [row for row in kept if row["mode"] in ("blind", "elsewhere")]
+    else:
+        rows = results.read(EXAMPLES / "company" / "results" / f"{'soft' if kind == 'soft mask' else 'told'}.csv")
+    return [(float(row["score"]), row["right"] == "1") for row in rows if row["status"] == "located"]
 
 
 def photographs_table() -> Iterator[str]:
@@ -118,7 +136,8 @@ def company_table() -> Iterator[str]:
         yield from (head, rule) if name == COMPANY[0] else ()
         for row in rows:
             kind, rest = row.removeprefix("| ").split(" | ", 1)
-            yield f"| {name}: {NAMES.get(kind, kind).partition(':')[0]} | {rest}"
+            frame, mirrored, _ = kind.partition(", mirrored")
+            yield f"| {name}: {NAMES.get(frame, frame).partition(':')[0]}{mirrored} | {rest}"
 
 
 def peers_table() -> Iterator[str]:

@@ -70,14 +70,14 @@ class ErrorRate(NamedTuple):
 #: Of each kind, by bands of the score, from the threshold on; a test counts them again in the results of `examples`.
 ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
     "mask": (
-        ErrorRate(3.5, 19, 2, 0.331),
-        ErrorRate(5.0, 43, 3, 0.191),
-        ErrorRate(8.0, 165, 1, 0.0333),
-        ErrorRate(15.0, 1941, 0, 0.0019),
+        ErrorRate(3.5, 21, 2, 0.304),
+        ErrorRate(5.0, 54, 3, 0.154),
+        ErrorRate(8.0, 189, 1, 0.0291),
+        ErrorRate(15.0, 2359, 0, 0.00156),
     ),
-    "soft mask": (),
-    "hints": (),
-    "photograph": (),
+    "soft mask": (ErrorRate(3.5, 10, 1, 0.445), ErrorRate(8.0, 51, 0, 0.0698), ErrorRate(15.0, 135, 0, 0.027)),
+    "hints": (ErrorRate(3.5, 19, 1, 0.26), ErrorRate(15.0, 112, 0, 0.0324)),
+    "photograph": (ErrorRate(3.5, 15, 0, 0.218),),
 }
 
 
@@ -471,6 +471,7 @@ class Location:
             score = 0.0 if np.isnan(other.score) else other.score
             return {"center": other.center_in(crs)._asdict(), "log10_odds": score}
 
+        rate = self.error_rate
         exact = place is not None and not np.isnan(place.lonlat_accuracy_m)
         made = {
             "schema": SCHEMA,
@@ -484,6 +485,7 @@ class Location:
             "query_to_pixel": None if content is None else _plain(content.lines_to_pixels),
             "part_read": "" if content is None else content.part,
             **dict(zip(("rmse_m", "rmse_px"), (place and place.rmse()) or (None, None), strict=True)),
+            "error_rate": rate and {"kind": content and content.kind, **rate._asdict(), "said": str(rate)},
             "runner_up": None if self.runner_up is None else of_place(self.runner_up),
             "alternatives": [{**of_place(other), **_to_take(other)} for other in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},
@@ -515,8 +517,6 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Camera):
         return value.to_dict()
-    if isinstance(value, ErrorRate):
-        return {**value._asdict(), "said": str(value)}
     if isinstance(value, CenterError):
         return value._asdict()
     return list(value) if isinstance(value, tuple) else value

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -5,7 +6,8 @@ import pytest
 from worlds.answers import placed, sure_to, with_place
 
 from roadgeo.errors import NotLocatedError
-from roadgeo.location import Content, Location
+from roadgeo.location import ERROR_RATES, Content, ErrorRate, Location
+from roadgeo.outputs.location_document import read_answer
 
 REASON = "only 3 intersections are seen, at least 6 are needed"
 REFUSED = Location("field.png", "not_located", REASON, content=Content((400, 300)))
@@ -73,7 +75,9 @@ def test_a_location_says_the_answer_in_one_line():
 def test_a_place_tells_how_often_such_places_were_wrong(location, score):
     rate = location.error_rate
     assert (None if rate is None else rate.score) == score
-    assert location.to_dict()["error_rate"] == (None if rate is None else {**rate._asdict(), "said": str(rate)})
+    assert location.to_dict()["error_rate"] == (
+        None if rate is None else {"kind": "mask", **rate._asdict(), "said": str(rate)}
+    )
 
 
 def test_pixels_go_to_the_map_and_back():
@@ -115,3 +119,17 @@ def test_the_middle_is_least_known_along_the_road_that_is_seen(azimuth_deg: floa
     assert error.across_m == pytest.approx(4.0, rel=0.01)
     assert abs((error.azimuth_deg - azimuth_deg + 90.0) % 180.0 - 90.0) < 0.01
     assert with_place(LOCATED, corner_covariance_m2=None).center_error is None
+
+
+@pytest.mark.parametrize("kind", ERROR_RATES)
+def test_a_rate_is_that_of_its_kind_of_query_and_comes_back_from_the_file(tmp_path, kind):
+    location = replace(LOCATED, content=replace(LOCATED.content, kind=kind))
+    path = tmp_path / "a_location.json"
+    path.write_text(json.dumps(location.to_dict()), encoding="utf-8")
+    assert location.error_rate in ERROR_RATES[kind]
+    assert read_answer(path).error_rate == location.error_rate
+
+
+@pytest.mark.parametrize(("at_most", "n"), [(0.304, "3"), (0.0291, "34"), (0.00156, "640"), (0.0000123, "81,000")])
+def test_a_rate_is_said_with_two_digits_and_never_better_than_it_is(at_most, n):
+    assert str(ErrorRate(8.0, 1, 0, at_most)) == f"of such places at most 1 in {n} is wrong"

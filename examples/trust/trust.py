@@ -295,7 +295,7 @@ def threshold_table(rows: Sequence[Row], least: float) -> list[list[str]]:
 def band_table(rows: Sequence[Row], least: float) -> list[list[str]]:
     """List for each band of `ERROR_RATES`, which results state, the share of wrong places."""
     table = [["score", "reported", "wrong"]]
-    edges = [least, *(rate.score for rate in ERROR_RATES if rate.score > least)]
+    edges = [least, *(rate.score for rate in ERROR_RATES["mask"] if rate.score > least)]
     for low, high in zip(edges, [*edges[1:], math.inf], strict=True):
         inside = [r for r in rows if low <= r.score < high]
         name = f"{low:g} to {high:g}" if high < math.inf else f"{low:g} and more"

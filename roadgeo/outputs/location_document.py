@@ -15,7 +15,7 @@ from roadgeo.geometry.frame import Frame, polygon_area
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.placement import Placement
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.location import SCHEMA, Content, Location
+from roadgeo.location import ERROR_RATES, SCHEMA, Content, Kind, Location
 from roadgeo.storage.crs import name_crs
 
 __all__ = ["read_answer", "read_location"]
@@ -89,10 +89,16 @@ def _from_document(document: dict[str, Any]) -> Location:
         str(document.get("attribution") or ""),
         tuple(places),
         Reason(document.get("reason_code") or Reason.NOTHING_STANDS_OUT),
-        None if size is None else Content(size),
+        None if size is None else Content(size, kind=_kind(document)),
         options=document.get("options"),
         reference_digest=str(document.get("reference_digest") or ""),
     )
+
+
+def _kind(document: dict[str, Any]) -> Kind:
+    """Return what places rest on; only a rate of errors depends on it."""
+    kind = (document.get("error_rate") or {}).get("kind")
+    return kind if kind in ERROR_RATES else "mask"
 
 
 def _place(entry: dict[str, Any], size: tuple[int, int] | None, footprint: Any = None) -> Placement:

@@ -18,7 +18,7 @@ def run(what: str, folder: Path) -> str:
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True).stdout
 
 
-@pytest.mark.parametrize(("what", "searches"), [("shards", 2), ("told", 4), ("twice", 3), ("mirrored", 2)])
+@pytest.mark.parametrize(("what", "searches"), [("shards", 2), ("told", 4), ("twice", 3), ("soft", 4)])
 def test_a_set_is_searched_once_and_counted(what: str, searches: int, tmp_path: Path) -> None:
     counted = run(what, tmp_path)
     with (tmp_path / f"{what}.csv").open(newline="") as file:

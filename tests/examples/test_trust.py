@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from roadgeo.evaluation.truth import Truth
-from roadgeo.location import ERROR_RATES
-from roadgeo.workflows import LocateOptions
 
 TRUST = Path(__file__).parents[2] / "examples" / "trust" / "trust.py"
 
@@ -56,17 +54,6 @@ def test_half_a_place_is_reported_at_no_threshold(trust, status, score):
     truth = Truth("a.png", "there_few", np.eye(3), None, (100, 100))
     answer = {"status": status, "log10_odds": 5.5}
     assert trust.row_of("porto", 1, "there", trust.Trial(truth, answer)).score == score
-
-
-def test_the_error_rates_that_results_state_are_those_counted(trust):
-    rows = [row for path in sorted((TRUST.parent / "results").glob("*.csv")) for row in trust.read_rows(path)]
-    highest = [rate.score for rate in ERROR_RATES[1:]] + [np.inf]
-    for rate, end in zip(ERROR_RATES, highest, strict=True):
-        found = [row for row in rows if row.reported(rate.score) and row.score < end]
-        wrong = sum(not row.right for row in found)
-        assert (rate.reported, rate.wrong) == (len(found), wrong)
-        assert rate.at_most == pytest.approx(trust.bounds(wrong, len(found))[1], abs=5e-4)
-    assert ERROR_RATES[0].score == LocateOptions().min_log10_odds
 
 
 def test_rows_come_back_from_their_file(trust, tmp_path):

@@ -173,13 +173,13 @@ def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Loc
     page = render_report(location, drone, porto.index)
     text = Reader(page).text
     assert "≈ ambiguous" in text
-    assert "570 m to the north-east, 8.0 behind by the score" in text
+    assert "570 m to the north-east, 8.5 behind by the score" in text
     unsure = render_report(with_place(location, score=-0.4), drone, porto.index)
     assert "to the north-east, 0.0 behind by the score" in Reader(unsure).text
     assert page.count('<g class="runner-up"') == 2  # around the footprint, and on the whole map
     elsewhere = Reader(render_report(on_another_map(location), drone, porto.index)).text
     assert "km to the" in elsewhere
-    assert ", on the map Oslo, 8.0 behind by the score" in elsewhere
+    assert ", on the map Oslo, 8.5 behind by the score" in elsewhere
     far = render_report(rival(location, -30_000.0, 0.0), drone, porto.index)
     assert "30 km to the west" in far
     assert far.count('<g class="runner-up"') == 1
