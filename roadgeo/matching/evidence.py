@@ -338,7 +338,7 @@ def _log_ratios(anyhow: int, blur: float) -> FloatArray:
 
 #: Factor by which weighted sums of random signs may exceed their standard deviation times z more often than a normal
 #: variable does (Bentkus and Dzindzalieta, Bernoulli 21, 2015).
-_OFTENER_THAN_NORMAL = 0.25 / (0.5 * math.erfc(1.0))
+_OFTENER_THAN_NORMAL = 0.5 / math.erfc(1.0)
 
 
 def log10_lead(difference: FloatArray) -> float:

@@ -20,7 +20,7 @@ from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.growing import SharedSweeps
-from roadgeo.matching.methods import Searched, less_than
+from roadgeo.matching.methods import N_PLACES, Searched, less_than
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import Rivals
@@ -34,8 +34,6 @@ __all__ = ["SCHEMA", "Explanation", "Funnel", "Story", "Told", "tell"]
 
 SCHEMA = "roadgeo.explanation/2"
 
-#: Most places that are shown, and most refused places that are verified without limits.
-_MAX_PLACES = 6
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
 #: Most refused places that are compared, and most barred proposals of an anchor that are grown.
@@ -57,16 +55,16 @@ _NOTHING = {
 class Funnel:
     """The output of each stage, in order."""
 
-    intersections: int = 0
-    anchors: int = 0  # intersections tried
-    tuples: int = 0  # of the mask, looked up
-    candidates: int = 0  # tuples of the map like them
-    proposals: int = 0  # places on which several agree
-    on_roads: int = 0  # proposals that put the roads around the anchor on roads
-    grown: int = 0  # followed outwards
-    survived: int = 0  # not given up on the way
-    verified: int = 0  # different ones, refined and compared with the map
-    measured: int = 0  # likely ones that were compared with all places nearby
+    intersections: int
+    anchors: int  # intersections tried
+    tuples: int  # of the mask, looked up
+    candidates: int  # tuples of the map like them
+    proposals: int  # places on which several agree
+    on_roads: int  # proposals that put the roads around the anchor on roads
+    grown: int  # followed outwards
+    survived: int  # not given up on the way
+    verified: int  # different ones, refined and compared with the map
+    measured: int  # likely ones that were compared with all places nearby
 
 
 @dataclass(frozen=True)
@@ -203,7 +201,7 @@ def tell(query: Query, searched: Searched, options: LocateOptions) -> Story:
     located, needed = location.located, options.min_log10_odds
     if searched.estimator is None or searched.search is None:  # nothing to search for, or another method searched
         ended = "intersections" if n == 0 else "verified" if stats.tuples_sampled else "anchors"
-        funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
+        funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified, 0)
         missing: tuple[str, ...] = () if located else (location.reason,)
         story = Story(name, "", needed, funnel, {}, None if located else ended, missing)
     else:
@@ -241,7 +239,7 @@ class _Course:
         """Grow some proposals that the hints bar, to report that they would fit."""
         for proposals, allowed, _ in self.events.of("screened"):
             barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
-            for place in self.estimator.grow(barred, np.arange(len(barred.reference)))[:_MAX_PLACES]:
+            for place in self.estimator.grow(barred, np.arange(len(barred.reference)))[:N_PLACES]:
                 fault = self.estimator.judge(place.matrix, rough=True)
                 if fault is not None:
                     self.events.note("refused", fault, place.matrix)
@@ -258,7 +256,7 @@ class _Course:
             for fault, matrix in islice(refusals, _MAX_REFUSED)
         ]
         refused.sort(key=lambda pair: -(pair[1].rate + pair[1].agreement.forward))
-        settled = [(fault, free.settle(place)[0]) for fault, place in refused[:_MAX_PLACES]]
+        settled = [(fault, free.settle(place)[0]) for fault, place in refused[:N_PLACES]]
         search: Search[Place] = Search(free)
         best = Rivals({search: free}, self.estimator.ledger, self.needed).compare(search)
         if best is None:
@@ -273,7 +271,7 @@ class _Course:
         """Return the best entry of each place."""
         kept: list[Place] = []
         for place in places:
-            if len(kept) == _MAX_PLACES or (kept and not math.isfinite(place.score)):
+            if len(kept) == N_PLACES or (kept and not math.isfinite(place.score)):
                 break
             if not any(place.same(other) for other in kept):
                 kept.append(place)

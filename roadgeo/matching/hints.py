@@ -222,31 +222,39 @@ def _read_effort(value: Any) -> Literal["quick", "full"]:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def _numbers(low: int, high: int) -> dict[str, Any]:
-    return {"type": "array", "items": {"type": "number"}, "minItems": low, "maxItems": high}
+def _numbers(count: int) -> dict[str, Any]:
+    return {"type": "array", "items": {"type": "number"}, "minItems": count, "maxItems": count}
+
+
+def _between(low: float, high: float, form: str) -> tuple[Callable[[Any], float], dict[str, Any]]:
+    """Return how a number within bounds is read, and its schema."""
+    return lambda value: _read_number(value, low, high, form), {"type": "number", "minimum": low, "maximum": high}
+
+
+_ABOVE_0 = {"type": "number", "exclusiveMinimum": 0}
 
 
 _TABLE = (
     Hint(
         "near", "near", "LON,LAT,RADIUS", "Near",
         "The middle lies within RADIUS metres of there. exif: where the camera says; so --gsd and --heading.",
-        _or_stated(read_place), _numbers(3, 3), group="Where to look",
+        _or_stated(read_place), _numbers(3), group="Where to look",
     ),
     Hint(
         "within", "within", "AREA", "In the country or state",
         "The middle lies in a country or state. Or within W,S,E,N in degrees.",
-        _read_area, _numbers(4, 4), group="Where to look",
+        _read_area, _numbers(4), group="Where to look",
     ),
     Hint(
         "gsd", "gsd_m", "SIZE|LO:HI", "Pixel size, metres",
         "Pixel size, metres: 0.3, 0.3+-10% or 0.3:0.6. It is that at the middle; 0.3 alone stands for 0.24 to"
         " 0.375, a quarter more or less.",
-        _or_stated(read_gsd), {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]}, "0.1:12",
+        _or_stated(read_gsd), {"oneOf": [_ABOVE_0, _numbers(2)]}, "0.1:12",
     ),
     Hint(
         "heading", "heading_deg", "DEG[+-DEG]", "Heading, degrees",
         "Where up points, degrees from north: 90+-10. Clockwise; the second number is 10 if left out.",
-        _or_stated(_read_heading), {"oneOf": [{"type": "number"}, _numbers(2, 2)]},
+        _or_stated(_read_heading), {"oneOf": [{"type": "number"}, _numbers(2)]},
     ),
     Hint(
         "north_up", "north_up", "", "Up is north",
@@ -256,13 +264,12 @@ _TABLE = (
     Hint(
         "max_tilt", "max_tilt_deg", "DEG", "Greatest tilt, degrees",
         "Greatest tilt of the camera, degrees. From the vertical.",
-        lambda value: _read_number(value, 0, 80, "degrees from 0 to 80"),
-        {"type": "number", "minimum": 0, "maximum": 80}, 60,
+        *_between(0, 80, "degrees from 0 to 80"), 60,
     ),
     Hint(
         "focal", "focal_px", "PIXELS|exif", "Focal length, pixels",
         "Focal length in pixels, or as the EXIF says. That of the photograph, if one goes with a mask.",
-        _or_stated(_read_focal), {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
+        _or_stated(_read_focal), {"oneOf": [_ABOVE_0, {"enum": ["exif"]}]},
     ),
     Hint(
         "effort", "effort", "quick|full", "Effort",
@@ -274,7 +281,7 @@ _TABLE = (
         "time_limit", "time_limit_s", "SECONDS", "Time limit, seconds",
         "Stop searching for an image then. The paper's matcher stops after 10 by itself.",
         lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
-        {"type": "number", "exclusiveMinimum": 0}, 60, "The search",
+        _ABOVE_0, 60, "The search",
     ),
 )  # fmt: skip
 

@@ -55,7 +55,7 @@ _MOST_LIKELIHOOD = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
 _MOST_CELLS = 1100
 #: Steps by which a place is moved, cells.
-_STEPS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+_STEPS = np.vstack([np.eye(2), -np.eye(2)])
 
 
 class Ground(NamedTuple):

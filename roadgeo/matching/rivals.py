@@ -38,7 +38,7 @@ from roadgeo.matching.triples import larger
 __all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
-_TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+_TURNS_DEG = tuple(90.0 * k for k in range(4))
 #: Most and fewest other places by which a gap is judged; their least spacing (log10).
 _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 #: Most times that a rival may turn out to be better.

@@ -38,6 +38,7 @@ from roadgeo.roads.intersections import unpack_branches
 
 __all__ = [
     "COARSE_PIXEL_M",
+    "LARGE_PIXEL_M",
     "PERSPECTIVE_SIGMA",
     "RADIUS_M",
     "RING_STEP",
@@ -54,7 +55,8 @@ __all__ = [
 ]
 
 
-#: Ratio of a ring around an intersection to the next, and how far directions may differ from a road's and belong to it.
+#: Ratio of a ring around an intersection to the next; how far directions may differ from a road's and belong to it, and
+#: how far branches that agree may be apart.
 RING_STEP, _TURN = 1.08, math.radians(20.0)
 #: Side of a raster's cells; how far from a road the middles of its cells lie, for at 200 m from an intersection half a
 #: step of scale moves a road by 8 m; and where the rings around intersections end, less than 63 cells away. Metres; a
@@ -155,13 +157,10 @@ def _draw(index: ReferenceIndex) -> RoadRaster:
 
 #: Where the map has hardly a road, chance is not less than this.
 _LEAST_DENSITY = 0.005
-_PER_RADIAN = WHOLE_TURN / (2.0 * math.pi)
-_TURN_STEPS = np.radians([-6.0, -3.0, 0.0, 3.0, 6.0])
+_PER_RADIAN = WHOLE_TURN / math.tau
+_TURN_STEPS = np.radians(3.0 * np.arange(-2, 3))
 _SCALE_STEPS = np.array([0.96, 1.04])
 
-
-#: How far branches that agree may be apart.
-_TOLERANCE = round(math.radians(20.0) * _PER_RADIAN)
 #: Roads nearer than this, metres, that run straight away from the intersection, with at least this cosine, are left
 #: out: they are its own branches, which agree by construction. The right place then stands out more.
 _OWN_M, _OWN_COS = 150.0, 0.95
@@ -245,7 +244,7 @@ class Voter:
         turn, max_off = -round(self.heading[0] * _PER_RADIAN), round(self.heading[1] * _PER_RADIAN)
         found = np.empty((_KEPT, 4))
         kept, tried = vote(
-            self.candidates, rays, _TOLERANCE, turn, max_off, self.scales, points,
+            self.candidates, rays, round(_TURN * _PER_RADIAN), turn, max_off, self.scales, points,
             _LEAST_POINTS, self.places, found,
         )  # fmt: skip
         wide = self._wide(around)
@@ -361,9 +360,9 @@ _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
 #: width on the ground lies in this range, metres.
 _TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
-#: Larger pixels hardly show the surroundings of an intersection: the search around a hint `near` goes no further than
-#: frames of such pixels reach.
-_FAR_M = 5.0
+#: Larger pixels, metres, hardly show the surroundings of an intersection: the search around a hint `near` goes no
+#: further than frames of such pixels reach.
+LARGE_PIXEL_M = 5.0
 
 
 def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0) -> tuple[float, float]:
@@ -442,7 +441,7 @@ class RoadSearch:
         scale = scales(camera, scene.road_width_px, coarseness)
         center, off = camera.heading or (0.0, 180.0)
         heading = math.radians(center), math.radians(min(off + AGREE_DEG, 180.0))
-        candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
+        candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * LARGE_PIXEL_M, scale[0])))
         candidates = candidates if among is None else np.intersect1d(candidates, among, assume_unique=True)
         self.voter = Voter(scene, index, scale, heading, candidates)
         self.grower = RoadGrower(scene, index, camera)

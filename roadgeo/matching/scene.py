@@ -47,8 +47,6 @@ _FIELD_CELLS = 400
 #: the image's up by as much.
 AGREE_DEG = 25.0
 MIN_COS = math.cos(math.radians(AGREE_DEG))
-#: A road's middle is traced within a pixel.
-_NEAR = (-1, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +165,8 @@ def _probability_at(points: FloatArray, probability: AnyArray) -> FloatArray:
     height, width = probability.shape
     stated = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability)
     column, row = np.clip((points * (1.0, -1.0)).astype(np.int64), 0, (width - 1, height - 1)).T
-    around = [stated[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
-    return np.asarray(np.max(around, axis=0) / PROBABILITY_SURE)
+    around = cv2.dilate(stated, np.ones((3, 3), np.uint8))  # a road's middle is traced within a pixel
+    return np.asarray(around[row, column] / PROBABILITY_SURE)
 
 
 def prepare_scene(

@@ -36,8 +36,6 @@ Drawn: TypeAlias = dict[tuple[float, ...], tuple[AnyArray, FloatArray]]
 _DIRECTIONS = 16
 #: Directions within this angle of a road's run along it.
 _ALONG = math.radians(18.0)
-#: Greatest count that a byte holds.
-_BYTE = 255
 
 
 #: A place nearer than this to a better place, metres, is the same place.
@@ -180,7 +178,7 @@ def _best_shifts(
     votes, some = np.zeros((span, span), np.uint16), np.zeros((span, span), np.uint8)
     for n, ((column, row), d) in enumerate(zip(cells[inside].tolist(), direction[inside].tolist(), strict=True), 1):
         some += layers[d, row : row + span, column : column + span]
-        if n % _BYTE == 0:  # bytes are added several times as fast
+        if n % np.iinfo(np.uint8).max == 0:  # bytes are added several times as fast
             votes += some
             some[:] = 0
     votes += some

@@ -17,13 +17,12 @@ from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
+from roadgeo.matching.road_search import LARGE_PIXEL_M
 
 __all__ = ["TruthStory", "finite_or_none", "tell_truth", "true_place"]
 
 #: Distance of a rough proposal's middle from the truth, in halves of the frame's diagonal, and at least in metres.
 _ROUGHLY, _AT_LEAST_M = 0.25, 50.0
-#: Larger pixels do not extend the distance from the map at which a place counts as off it.
-_LARGE_PIXEL_M = 5.0
 
 #: The stage that lost the true place, and how, by the last one that met it.
 _LOST = {
@@ -129,7 +128,7 @@ class _TruePlace:
     ) -> TruthStory:
         """Describe the stage that lost it."""
         estimator = self.estimator
-        reach_m = estimator.scene.half_size * min(estimator.options.camera.gsd_m[1], _LARGE_PIXEL_M)
+        reach_m = estimator.scene.half_size * min(estimator.options.camera.gsd_m[1], LARGE_PIXEL_M)
         lost_at: str | None
         if np.hypot(*(estimator.index.xy - self.xy).T).min() > 2.0 * reach_m:
             lost_at, how = "map", "lies off the map that was searched"
