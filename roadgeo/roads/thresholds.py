@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._text import log_of
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import width_by_area
@@ -22,6 +23,8 @@ __all__ = [
     "ground_and_road",
     *("refuse_different_bands", "spread_probability"),
 ]
+
+_LOG = log_of(__name__)
 
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
@@ -44,10 +47,10 @@ _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
 #: Shares of neighbours of one number in a mask of numbered roads: of all, and without the commonest number.
 #: Smooth edges of a plain mask are a pixel wide: they have at most two neighbours in three of their value.
 _ALIKE, _OTHERS_ALIKE = 0.9, 0.8
-#: The same saved as JPEG: roads are clearly lighter than the ground, and than the traces that JPEG leaves around them.
-#: Few values are about half of the greatest nearby (pixels): 0.25 of those that are most of it, 0.39 in soft maps.
-#: Many roads have less than most of the lightest: 0.4, none in plain masks.
-_CLEAR, _RINGING, _NEARBY_PX, _HALF, _MOST, _FEW, _MANY = 48, 20, 7, 0.3, 0.7, 0.3, 0.25
+#: The same saved as JPEG: its traces around roads are fainter than the first number; edges are as steep as before,
+#: of the greatest value nearby (0.99 at least, in a model's maps 0.96 at most); and the greatest values nearby differ,
+#: by their standard deviation, of the mean (0.27 at least, 0.06 at most in plain masks).
+_RINGING, _NEARBY_PX, _STEEP, _VARIED = 20, 7, 0.98, 0.25
 _GREY = 6  # bands of a grey picture differ by this at most, rounded by JPEG or WebP
 #: Share of neighbours that differ in a photograph, and their usual difference, of the span.
 _RESTLESS, _SMOOTH = 0.3, 0.15
@@ -115,6 +118,11 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
         )
     if sample.observed.dtype.kind in "iu" and high <= _MAX_CLASS and not _is_dark_photograph(sample, levels):
         _refuse_classes(sample, levels)
+        _LOG.warning(
+            "%s: values to %g are read as a faint soft map; numbers of roads, blurred by JPEG, would look so, too: "
+            "save them without loss",
+            *(sample.name, high),
+        )
         return _spread(values, _otsu(values))
     _refuse_colours(sample, levels)
     if sample.observed.dtype.kind == "f" and low >= 0 and high <= 1:
@@ -189,16 +197,14 @@ def _find_blurred(rows: AnyArray) -> float | None:
         return None
     is_dark = np.median(rows) < 128
     above = rows if is_dark else ~rows
-    nearby = cv2.dilate(above, np.ones((_NEARBY_PX, _NEARBY_PX), np.uint8))
-    values = above[nearby > _CLEAR]
-    shares = values / nearby[nearby > _CLEAR]
-    roads = values[shares >= _MOST]
-    if len(roads) == 0 or np.median(above) > 0 or not are_roads(cv2.medianBlur(above, 3) > _RINGING):
+    shown = cv2.medianBlur(above, 3) > _RINGING
+    if np.median(above) > 0 or not are_roads(shown):
         return None
-    are_steep = np.count_nonzero((shares > _HALF) & (shares < _MOST)) < _FEW * len(roads)
-    if not are_steep or np.mean(roads < _MOST * np.quantile(roads, 0.95)) < _MANY:
-        return None
-    return float(_RINGING if is_dark else 255 - _RINGING)
+    near, nearby = (np.ones((side, side), np.uint8) for side in (3, _NEARBY_PX))
+    edges, greatest = cv2.morphologyEx(above, cv2.MORPH_GRADIENT, near), cv2.dilate(above, nearby)[shown]
+    is_steep = np.median(cv2.dilate(edges, nearby)[shown] / greatest) > _STEEP
+    is_varied = greatest.std() > _VARIED * greatest.mean()
+    return float(_RINGING if is_dark else 255 - _RINGING) if is_steep and is_varied else None
 
 
 def are_patches(values: AnyArray, shown: BoolArray) -> bool:

@@ -206,7 +206,9 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
         raster, sample = _without_unlabelled(raster, sample)
     number = find_numbered(sample) if threshold is None else None
     if number is not None:
-        _LOG.warning("%s: holds a number for each of its roads: all but its ground is road", raster.name)
+        _LOG.warning(
+            "%s: holds a number for each of its roads: all but its ground, to %g, is road", raster.name, number
+        )
     threshold = threshold if number is None else number
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
     levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None

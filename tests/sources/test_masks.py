@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import re
 from pathlib import Path
 
 import cv2
@@ -761,6 +762,15 @@ def test_a_fill_in_a_soft_map_is_not_observed(roads: np.ndarray, kind: str, fill
     assert np.mean(found.roads[:, 20:] != roads[:, 20:]) < 0.05
 
 
+def streets() -> np.ndarray:
+    """Draw a grid of them, (400, 500)."""
+    roads = np.zeros((400, 500), np.uint8)
+    for at in range(40, 400, 90):
+        cv2.line(roads, (0, at), (500, at + 60), 1, 6)
+        cv2.line(roads, (at, 0), (at + 40, 400), 1, 6)
+    return roads
+
+
 def numbered(roads: np.ndarray, kind: str, length: int = 12) -> np.ndarray:
     """Give each road a number."""
     bands = np.indices(roads.shape).sum(axis=0) // length % 15  # pieces along the roads
@@ -820,15 +830,37 @@ def test_numbers_above_0_are_road(
 def test_numbers_that_are_saved_with_loss_are_road(
     kind: str, suffix: str, quality: int, ground: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    roads = np.zeros((400, 500), np.uint8)
-    for at in range(40, 400, 90):
-        cv2.line(roads, (0, at), (500, at + 60), 1, 6)
-        cv2.line(roads, (at, 0), (at + 40, 400), 1, 6)
+    roads = streets()
     values = numbered(roads, kind, 60)
     PIL.Image.fromarray(values ^ np.uint8(ground)).save(tmp_path / f"a.{suffix}", quality=quality)
     found = read_mask(tmp_path / f"a.{suffix}", voids=False)
     assert np.mean(found.roads != roads) < 0.02
     assert "a number for each of its roads" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["instances", "lanes"])
+def test_numbers_that_loss_makes_a_soft_map_of_are_told_or_refused(
+    kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = numbered(streets(), kind, 60)
+    for suffix, quality in itertools.product(("jpg", "webp"), (50, 75, 95)):
+        caplog.clear()
+        PIL.Image.fromarray(values).save(tmp_path / f"a.{suffix}", quality=quality)
+        try:
+            read_mask(tmp_path / f"a.{suffix}", voids=False)
+        except MaskError as error:
+            assert "holds the classes" in str(error)  # noqa: PT017 - either of the two
+        else:
+            assert re.search("numbers of roads, blurred by JPEG|a number for each of its roads", caplog.text)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("peak", [60, 120, 255])
+def test_a_soft_map_of_uneven_roads_holds_no_numbers(sigma: float, peak: int, caplog: pytest.LogCaptureFixture) -> None:
+    roads = streets()
+    trust = 0.3 + 0.7 * np.abs(np.sin(np.add.outer(np.arange(400), np.arange(500)) / 40))
+    read_mask(np.rint(peak * trust * cv2.GaussianBlur(roads.astype(np.float32), (0, 0), sigma)).astype(np.uint8))
+    assert "a number for each of its roads" not in caplog.text
 
 
 @pytest.mark.parametrize("container", ["array", "tif", "rgb", "colours"])
