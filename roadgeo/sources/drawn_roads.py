@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo._text import log_of
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.homography import shift
 from roadgeo.geometry.mask import RoadMask
@@ -23,8 +22,6 @@ from roadgeo.geometry.projection import choose_plane, serves_as_plane, to_lonlat
 from roadgeo.storage.crs import known_crs
 
 __all__ = ["Drawing", "Units", "draw_roads"]
-
-_LOG = log_of(__name__)
 
 Units = Literal["auto", "pixels", "metres"]
 
@@ -76,17 +73,14 @@ def draw_roads(
         The file holds no lines, or its units are unknown.
     """
     from roadgeo.sources.roads import are_exchanged
-    from roadgeo.sources.streams import EXCHANGED, read_lines
+    from roadgeo.sources.streams import read_lines, tell_state
 
     name = os.fspath(path)
     try:
         read = read_lines(Path(path), layer, areas=True)
     except RoadSourceError as error:
         raise MaskError(str(error)) from error
-    if are_exchanged(read):
-        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", name, EXCHANGED)
-    if "part" in read.meta:
-        _LOG.warning("%s: %s", name, read.meta["part"])
+    tell_state(name, read.meta | ({"exchanged": True} if are_exchanged(read) else {}))
     import shapely
     from rasterio.features import rasterize
 

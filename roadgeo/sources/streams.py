@@ -32,6 +32,7 @@ __all__ = [
     "reading",
     "stream_lines",
     "tell_source",
+    "tell_state",
 ]
 
 _LOG = log_of(__name__)
@@ -239,12 +240,7 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             by = f", by its column {meta['kind_columns']}; --kinds all keeps them" if meta.get("kind_columns") else ""
             counts = f"{meta[key]:,}", f"{meta['features']:,}"
             _LOG.warning("%s: left out %s of %s features, which %s", name, *counts, what + by * (key == "no_roads"))
-    if "exchanged" in meta:
-        _LOG.warning("%s: its coordinates do not lie where its CRS is made for; %s", name, EXCHANGED)
-    if "part" in meta:
-        _LOG.warning("%s: %s", name, meta["part"])
-    if "encoding" in meta:
-        _LOG.warning("%s: its text is not in the encoding that it names; read as Latin-1, names may be garbled", name)
+    tell_state(name, meta)
     if meta.get("without_kind"):
         kindless, kept = f"{meta['without_kind']:,}", f"{meta['kept']:,}"
         _LOG.warning("%s: %s of %s lines have no kind of road; they are taken, paths too", name, kindless, kept)
@@ -256,6 +252,17 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             f"{meta['kept']:,}",
             f"; --layer chooses by {meta['levels']}" if "levels" in meta else "",
         )
+
+
+def tell_state(name: str, meta: Mapping[str, Any]) -> None:
+    """Report faults of a source as a whole."""
+    faults = {
+        "exchanged": f"its coordinates do not lie where its CRS is made for; {EXCHANGED}",
+        "part": meta.get("part"),
+        "encoding": "its text is not in the encoding that it names; read as Latin-1, names may be garbled",
+    }
+    for key in faults.keys() & meta.keys():
+        _LOG.warning("%s: %s", name, faults[key])
 
 
 @contextmanager
