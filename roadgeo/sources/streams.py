@@ -261,8 +261,9 @@ def tell_state(name: str, meta: Mapping[str, Any]) -> None:
         "part": meta.get("part"),
         "encoding": "its text is not in the encoding that it names; read as Latin-1, names may be garbled",
     }
-    for key in faults.keys() & meta.keys():
-        _LOG.warning("%s: %s", name, faults[key])
+    for key, fault in faults.items():
+        if key in meta:
+            _LOG.warning("%s: %s", name, fault)
 
 
 @contextmanager
