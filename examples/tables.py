@@ -118,7 +118,7 @@ def reported(kind: Kind) -> list[tuple[float, bool]]:
         return [(float(row["score"]), row["right"] == "1") for row in rows if float(row["score"]) >= NEEDED]
     if kind == "photograph":
         kept = results.read(EXAMPLES / "photographs" / "results" / "photographs.csv")
-        rows = [row for row in kept if row["mode"] in ("blind", "elsewhere")]
+        rows = [row for row in kept if row["mode"] in ("blind", "told", "elsewhere")]
     else:
         rows = results.read(EXAMPLES / "company" / "results" / f"{'soft' if kind == 'soft mask' else 'told'}.csv")
     return [(float(row["score"]), row["right"] == "1") for row in rows if row["status"] == "located"]

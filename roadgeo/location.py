@@ -77,7 +77,7 @@ ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
     ),
     "soft mask": (ErrorRate(3.5, 10, 1, 0.445), ErrorRate(8.0, 51, 0, 0.0698), ErrorRate(15.0, 135, 0, 0.027)),
     "hints": (ErrorRate(3.5, 19, 1, 0.26), ErrorRate(15.0, 112, 0, 0.0324)),
-    "photograph": (ErrorRate(3.5, 15, 0, 0.218),),
+    "photograph": (ErrorRate(3.5, 32, 0, 0.109),),
 }
 
 
