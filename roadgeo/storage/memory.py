@@ -45,6 +45,10 @@ def bounded(
     before : int, optional
         What the process held before the file was opened, bytes; by default what it holds now.
 
+    Raises
+    ------
+    RoadgeoError
+        Of the class `fault`: the block takes more.
     """
     held, thread = _held_bytes() if before is None else before, threading.get_ident()
     if held is None or thread in _bounds or not (is_inside() or MEMORY in os.environ):

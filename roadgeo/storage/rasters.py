@@ -493,7 +493,8 @@ def _reader() -> type[DatasetReader]:
 def _keep_few_drivers() -> None:
     """Have rasterio's GDAL forget all drivers but those above, whatever build it is: for what a virtual raster names.
 
-    It is for good, as the fence is.
+    It is for good, as the fence is. GDAL reads which drivers to leave out when it registers them. rasterio registers
+    them once in a process and has no public way to do so again, hence its private flag.
     """
     from rasterio import _env
 
