@@ -20,12 +20,12 @@ from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import log_of
-from roadgeo.errors import RoadgeoError
+from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
 from roadgeo.running.pool import Lost
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
 
-__all__ = ["Full", "ImageRequest", "ImageWorkers", "Reply", "Serving"]
+__all__ = ["ImageRequest", "ImageWorkers", "Reply", "Serving"]
 
 _LOG = log_of(__name__)
 
@@ -34,6 +34,8 @@ _GRACE_S = 15.0
 #: The same where progress is reported, and the client may cancel: a busy machine is no fault.
 _PATIENT_S = 90.0
 
+#: The status of an error about an image; of others it is 500. Photographs need a network that may not be there.
+_STATUSES: dict[type[RoadgeoError], int] = {MaskError: 422, OutputError: 422, ModelError: 415}
 #: The status of a lost task, and the sentence about it.
 _LOST = {
     "died": (500, "it broke two processes, one after another; send another image"),
@@ -41,13 +43,6 @@ _LOST = {
     "called off": (410, "it was called off"),
     "no worker": (503, "{}; come again"),
 }
-
-
-class Full(HTTPException):
-    """As many requests as may be are working or waiting."""
-
-    def __init__(self) -> None:
-        super().__init__(503, "as many requests as may be are waiting; come again")
 
 
 @dataclass(frozen=True)
@@ -132,11 +127,11 @@ class ImageWorkers:
 
         Raises
         ------
-        Full
+        HTTPException
             Too many work or wait already.
         """
         if not self._places.acquire(blocking=False):
-            raise Full
+            raise HTTPException(503, "as many requests as may be are waiting; come again")
         place = ExitStack()
         place.callback(self._places.release)
         return place
@@ -180,7 +175,6 @@ class Serving:
 
     def prepare(self) -> Callable[[ImageRequest], Reply]:
         """Open the references, and load the network."""
-        from roadgeo.errors import ModelError
         from roadgeo.kernels.warmup import warm_up
         from roadgeo.reference.opening import open_references
         from roadgeo.running.photographs import load_model
@@ -194,21 +188,15 @@ class Serving:
 
 def _reply(request: ImageRequest, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Reply:
     """Locate the image, or write an output; the one place where what goes wrong with an image is caught."""
-    from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
-
     try:
         return _write(request, references) if request.wanted else _locate(request, references, say, threads)
-    except (MaskError, OutputError) as error:
-        return Reply(422, {"detail": _without(request.path, str(error))})
-    except ModelError as error:  # the image is a photograph, and none are read here
-        return Reply(415, {"detail": _without(request.path, str(error))})
     except RoadgeoError as error:
-        return Reply(500, {"detail": _without(request.path, str(error))})
+        status = next((status for kind, status in _STATUSES.items() if isinstance(error, kind)), 500)
+        detail = str(error)
     except Exception as error:
         _LOG.exception("a fault of roadgeo")
-        return Reply(
-            500, {"detail": f"a fault of roadgeo: {type(error).__name__}: {_without(request.path, str(error))}"}
-        )
+        status, detail = 500, f"a fault of roadgeo: {type(error).__name__}: {error}"
+    return Reply(status, {"detail": _without(request.path, detail)})
 
 
 def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads: int) -> Reply:

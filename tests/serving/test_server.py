@@ -19,6 +19,7 @@ from urllib.parse import urljoin
 import cv2
 import numpy as np
 import pytest
+from starlette.exceptions import HTTPException
 
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Content, Location
@@ -27,7 +28,7 @@ from roadgeo.running.passes import Sighting
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import Full, Reply, _reply
+from roadgeo.serving.workers import Reply, _reply
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
@@ -47,7 +48,7 @@ class Workers:
 
     def take_place(self):
         if not self.places.acquire(blocking=False):
-            raise Full
+            raise HTTPException(503, "full; come again")
         place = ExitStack()
         place.callback(self.places.release)
         return place
