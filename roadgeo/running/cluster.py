@@ -21,9 +21,9 @@ from typing import Any, TypeVar
 
 from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
-from roadgeo.running.pool import Lost, Pool, Work
+from roadgeo.running.pool import Lost, Pool, Work, enter
 from roadgeo.running.processes import without_interrupts
-from roadgeo.storage.fence import Fence, current, is_started_inside
+from roadgeo.storage.fence import Fence, current
 from roadgeo.storage.folders import private_temporary_dir
 
 __all__ = ["Cluster", "DaskWorkers"]
@@ -121,7 +121,7 @@ class DaskWorkers(Pool):
 
     def __init__(self, client: Any, work: Any) -> None:
         """Take them as Dask's client knows them."""
-        self._client, self._made, self._under_way = client, Made.of(work), set[Any]()
+        self._client, self._made = client, Made.of(work)
 
     def names(self) -> list[str]:
         """Return their addresses, in order; at least one."""
@@ -144,20 +144,16 @@ class DaskWorkers(Pool):
         worker = getattr(task, "worker", "")
         where = {"workers": [worker], "allow_other_workers": True} if worker else {}
         future = self._client.submit(do_prepared, self._made, task, pure=False, **where)
-        self._under_way.add(future)
         try:
             return future.result()
         except KilledWorker:
             return Lost("died", "the workers that it was given to died, one after another")
         except (CancelledError, OSError) as error:
             raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
-        finally:
-            self._under_way.discard(future)
 
     def close(self) -> None:
         """Call off what is under way."""
-        for future in list(self._under_way):
-            future.cancel()
+        self._client.close()
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------
@@ -199,13 +195,9 @@ def do_prepared(made: Made, task: Any) -> Any:
 def _prepare(made: Made) -> Any:
     """Make work ready on the thread that will do it."""
     os.chdir(made.folder)
-    if made.fence is not None and not is_started_inside():
-        made.fence.enter()
-    import cv2
-
+    enter(made.fence)
     from roadgeo.kernels.warmup import warm_up
 
-    cv2.setNumThreads(1)
     with _one_of_host():
         warm_up()
     return pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)

@@ -18,8 +18,9 @@ from itertools import islice
 from typing import Any, Literal, Protocol, TypeVar
 
 from roadgeo._progress import Say, say_nothing
+from roadgeo.storage.fence import Fence, is_started_inside
 
-__all__ = ["Lost", "Pool", "Work"]
+__all__ = ["Lost", "Pool", "Work", "enter"]
 
 Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
@@ -126,3 +127,15 @@ class Pool(ABC):
 
 def _died(result: Any) -> bool:
     return isinstance(result, Lost) and result.why == "died"
+
+
+# --- in a worker ------------------------------------------------------------------------------------------------------
+
+
+def enter(within: Fence | None) -> None:
+    """Put the thread that works inside a fence, and leave the other processors to other workers."""
+    if within is not None and not is_started_inside():
+        within.enter()
+    import cv2
+
+    cv2.setNumThreads(1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
-import multiprocessing.connection
 import os
 import pickle
 import queue
@@ -22,11 +21,11 @@ from typing import Any, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Lost, Pool, Work
+from roadgeo.running.pool import Lost, Pool, Work, enter
 from roadgeo.storage import fence
 from roadgeo.storage.files import remove_own
 
-__all__ = ["Processes", "end_with_parent", "run", "tell", "without_interrupts"]
+__all__ = ["Processes", "run", "tell", "without_interrupts"]
 
 _log = logging.getLogger("roadgeo")  # of all modules
 
@@ -239,18 +238,14 @@ def _serve(
     level: int,
     work: Any,
     clean: Callable[[], None] | None,
-    within: fence.Fence | None = None,
+    within: fence.Fence | None,
 ) -> None:
     """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
-        end_with_parent(clean)
-        if within is not None and not fence.is_inside():  # the fork server may be older than the fence
-            within.enter()
-        import cv2
-
-        cv2.setNumThreads(1)  # the processes share the processors already
+        _end_with_parent(clean)
+        enter(within)  # the fork server may be older than the fence
         _log.setLevel(level)
         _parents[:] = [pipe]
         kind, do = _reply(work.prepare)
@@ -276,18 +271,17 @@ def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
         return "failed", RuntimeError(f"{type(error).__name__}: {error}")
 
 
-def end_with_parent(clean: Callable[[], None] | None = None) -> None:
+def _end_with_parent(clean: Callable[[], None] | None) -> None:
     """End this process when the one that started it is gone, however it went: nobody waits for its results.
 
     It does the remaining work of the parent (`clean`), and ends its main thread first (SIGTERM), so that it
     may remove half-written files.
     """
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
+    parent: Any = multiprocessing.parent_process()
+    main = threading.main_thread().ident or 0
 
     def watch() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
+        parent.join()
         if clean is not None:
             clean()
         if hasattr(signal, "pthread_kill"):
@@ -295,7 +289,6 @@ def end_with_parent(clean: Callable[[], None] | None = None) -> None:
             time.sleep(_GRACE_S)
         os._exit(1)
 
-    main = threading.main_thread().ident or 0
     threading.Thread(target=watch, daemon=True).start()
 
 
