@@ -64,15 +64,14 @@ def summary_table(groups: Sequence[Summary]) -> tuple[list[str], list[list[str]]
 def verdicts(evaluation: Evaluation) -> Iterator[str]:
     """Describe the numbers in the tables, and whether scores and standard deviations hold."""
     yield _NOTE
-    broken = [step for step in evaluation.odds if not step.holds]
-    surest = next((step for step in reversed(evaluation.odds) if step.wrong.of), None)
-    if broken:
-        step = broken[0]
-        wrong = f"{step.wrong.hits} of {step.wrong.of}"
-        yield f"Scores promise too much: {wrong} located at {step.at_least:g} or more are wrong."
-    elif surest is not None:
-        located = evaluation.odds[0].wrong
-        yield f"Scores hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
+    wrong, located = (sum(getattr(band.wrong, name) for band in evaluation.bands) for name in ("hits", "of"))
+    broken = next((band for band in evaluation.bands if not band.holds), None)
+    if broken is not None:
+        stated = f"{100 * broken.at_most:.2g} % is stated at most"
+        counted = f"{broken.wrong.hits} of {broken.wrong.of}"
+        yield f"Scores promise too much: {counted} located with scores from {broken.score:g} are wrong, {stated}."
+    elif located:
+        yield f"Scores hold: {wrong} of {located} located masks are wrong, no count contradicts their error rates."
     if evaluation.sigma.within_1.of:
         robust = f"robustly {evaluation.sigma.robust:.2f}"
         yield f"Corner errors are {evaluation.sigma.rms:.2f} times what is claimed ({robust})."

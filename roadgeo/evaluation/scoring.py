@@ -1,4 +1,4 @@
-"""Scoring: whether masks were located where they lie, and whether reported odds and standard deviations are calibrated.
+"""Scoring: whether masks were located where they lie, and whether error rates and standard deviations are calibrated.
 
 A mask counts as right when it was reported "located" and the middle of its frame lies within a radius of the truth.
 precision = right / located, recall = right / masks that have a place on the map. A mask that has none counts against
@@ -17,18 +17,19 @@ import numpy as np
 from roadgeo.evaluation.truth import Truth
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.location import ERROR_RATES
 
 __all__ = [
     "BREAKDOWNS",
+    "Band",
     "Calibration",
     "Evaluation",
-    "OddsStep",
     "Score",
     "Share",
     "Spread",
     "Summary",
     "break_down",
-    "calibrate_odds",
+    "calibrate_scores",
     "calibrate_sigma",
     "evaluate",
     "score",
@@ -231,30 +232,29 @@ def break_down(scores: Sequence[Score], by: str) -> list[Summary]:
 
 
 @dataclass(frozen=True)
-class OddsStep:
-    """Wrong ones of the masks located at odds of 10^`at_least` or more, and the share that such odds allow."""
+class Band:
+    """Wrong ones of the masks located with scores of a band, from `score` to the next, and the share stated at most."""
 
-    at_least: float
+    score: float
     wrong: Share
-    allowed: float
+    at_most: float
 
     @property
     def holds(self) -> bool:
-        """Whether the count does not contradict the claim: the interval reaches down to it."""
-        return self.wrong.of == 0 or self.wrong.low <= self.allowed
+        """Whether the count does not contradict the statement: the interval reaches down to it."""
+        return self.wrong.of == 0 or self.wrong.low <= self.at_most
 
 
-def calibrate_odds(
-    scores: Sequence[Score], steps: Sequence[float] = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24)
-) -> list[OddsStep]:
-    """Count the wrong ones among the masks located at least so surely; masks without a place are wrong when located."""
+def calibrate_scores(scores: Sequence[Score]) -> list[Band]:
+    """Count the wrong ones in each band of `location.ERROR_RATES`; masks without a place are wrong when located."""
+    rates = ERROR_RATES["mask"]
     reported = [s for s in scores if s.located and math.isfinite(s.log10_odds)]
-    table = []
-    for step in steps:
-        surer = [s for s in reported if s.log10_odds >= step]
-        # Odds of 10^k to 1 allow one wrong in 10^k + 1.
-        table.append(OddsStep(step, share(sum(not s.right for s in surer), len(surer)), 1 / (1 + 10**step)))
-    return table
+    band_of = np.digitize([s.log10_odds for s in reported], [rate.score for rate in rates]) - 1
+    bands = [[s for s, band in zip(reported, band_of, strict=True) if band == k] for k in range(len(rates))]
+    return [
+        Band(rate.score, share(sum(not s.right for s in band), len(band)), rate.at_most)
+        for rate, band in zip(rates, bands, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class Evaluation:
     scores: list[Score]
     total: Summary
     breakdowns: dict[str, list[Summary]]
-    odds: list[OddsStep]
+    bands: list[Band]
     sigma: Calibration
 
     def to_dict(self) -> dict[str, Any]:
@@ -332,7 +332,7 @@ def evaluate(
         scores,
         summarize("all", scores),
         {by: table for by, table in tables.items() if len(table) > 1 or by == "kind"},
-        calibrate_odds(scores),
+        calibrate_scores(scores),
         calibrate_sigma(scores),
     )
 

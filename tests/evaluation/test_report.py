@@ -52,7 +52,7 @@ def test_tables_and_verdicts_are_shown(town):
     truths = [replace(truth(k), crs=town[1].plane.crs) for k in range(12)]
     answers = [{**answer(k), "crs": town[1].plane.crs} for k in range(12)]
     page = render_report(evaluate(truths, answers), truths, "all right", [town[1]])
-    assert "no count contradicts them" in page
+    assert "no count contradicts their error rates" in page
     assert "Tilt of the camera, degrees" in page
     assert '<g class="map-roads">' in page
 

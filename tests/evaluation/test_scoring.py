@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from roadgeo.evaluation.scoring import (
     Score,
     break_down,
-    calibrate_odds,
+    calibrate_scores,
     calibrate_sigma,
     evaluate,
     score,
@@ -19,6 +19,7 @@ from roadgeo.evaluation.scoring import (
     summarize,
 )
 from roadgeo.evaluation.truth import Truth
+from roadgeo.location import ERROR_RATES
 
 MATRIX = np.array([[1.0, 0.0, 330000.0], [0.0, -1.0, 4690000.0], [0.0, 0.0, 1.0]])
 TRUTH = Truth("a.png", "clean", MATRIX, "EPSG:32619", (1000, 800), True, {"n_intersections": 40, "tilt_deg": 5})
@@ -120,15 +121,18 @@ def test_breakdowns_put_each_query_into_one_class():
     assert [s.name for s in break_down(scores, "kind")] == ["k"]
 
 
-def test_odds_that_promise_too_much_are_told():
-    honest = [Score("", "k", True, "located", k > 0, log10_odds=2.0) for k in range(200)]
-    table = {step.at_least: step for step in calibrate_odds(honest)}
-    assert table[2].wrong.hits == 1
-    assert table[2].holds
-    assert table[3].wrong.of == 0
-    boastful = [Score("", "k", True, "located", k > 20, log10_odds=6.0) for k in range(200)]
-    assert not calibrate_odds(boastful, [6])[0].holds
-    assert calibrate_odds(boastful, [0])[0].holds
+def located(n_wrong, log10_odds):
+    return [Score("", "k", True, "located", k >= n_wrong, log10_odds=log10_odds) for k in range(200)]
+
+
+def test_scores_that_promise_too_much_are_told():
+    for rate in ERROR_RATES["mask"]:
+        honest, boastful = (round(200 * share * rate.at_most) for share in (0.5, 2.0))
+        found = {band.score: band for band in calibrate_scores(located(honest, rate.score))}
+        assert (found[rate.score].wrong.hits, found[rate.score].wrong.of) == (honest, 200)
+        assert all(band.holds for band in found.values())
+        found = {band.score: band for band in calibrate_scores(located(boastful + 4, rate.score))}
+        assert [score for score, band in found.items() if not band.holds] == [rate.score]
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
@@ -146,7 +150,7 @@ def test_sigmas_are_measured_by_the_errors(scale):
 
 def test_no_results_are_no_calibration():
     assert math.isnan(calibrate_sigma([]).rms)
-    assert all(step.holds for step in calibrate_odds([]))
+    assert all(band.holds for band in calibrate_scores([]))
 
 
 def test_an_evaluation_is_plain_json():
