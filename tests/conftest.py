@@ -34,7 +34,7 @@ settings.load_profile("steady")
 
 #: Seconds of processors of each slow test, of its programs, too; `--measure` renews it.
 SECONDS = Path(__file__).with_name("seconds.json")
-SLOW_S = 2.0
+SLOW_S = 1.0
 
 #: Left to the night, with all that is slow or needs one of the fixtures below: how the names of these tests begin.
 NIGHTLY = (
@@ -50,12 +50,13 @@ NIGHTLY = (
     "tests/serving/test_workers.py::test_neither_processes",
     "tests/test_endurance.py",
 )
-#: Never left, however slow: what a user meets first, and what writers that are killed leave behind.
+#: Never left, however slow: what a user meets first, kernels and their twins, and what killed writers leave behind.
 DAILY = (
     "tests/accept/",
     "tests/cli/",
     "tests/docs/test_docs.py::test_a_page_does_what_it_says[README.md]",
     "tests/docs/test_docs.py::test_a_page_does_what_it_says[docs/tutorial.md]",
+    "tests/kernels/",
     "tests/reference/test_files.py",
     "tests/test_corpus.py",
 )
