@@ -57,6 +57,8 @@ _HARDLY = 0.5
 #: A place that leads all earlier places by this score is compared with places nearby; if it leads these too, a lens is
 #: tried. The weakest of ten right places with a lens, or fitted to a part only, led by 3.2.
 _LEADING = 2.0
+#: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
+_LEAST_SHARE_BY_ROADS = 0.2
 #: Intersections of a place, those with the rarest tuples first, that are looked up elsewhere on the map before it is
 #: accepted; how; and the part of their neighbours there that an equal place has at least.
 _N_EQUALS, _OWN_TUPLES, _EQUAL = 12, TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
@@ -386,9 +388,10 @@ class TripleEstimator:
         A place less likely than `least` is not refined again. Also returns whether it converged.
         """
         before, best = -1.0 if place.refined is None else place.agreement.forward, -1.0
+        options = self.refinement(place)
         for _ in range(5):
             args = place.matrix, place.scene, place.index, place.matched
-            refined = refine(*args, self.refine_options, n_points, held=place.by_roads)
+            refined = refine(*args, options, n_points, held=place.by_roads)
             fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or fault is not None or self._is_far(refined.matrix):
                 return (place, True) if best >= 0.0 else (place.but(fault=fault, score=-math.inf), False)
@@ -401,6 +404,11 @@ class TripleEstimator:
                 break
             best = agreeing
         return place, True
+
+    def refinement(self, place: Place) -> RefineOptions:
+        """Return the options for refining a place."""
+        usual = self.refine_options
+        return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if place.by_roads and self.options.roads else usual
 
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""

@@ -20,7 +20,6 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import FEWEST
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import (
-    LITTLE,
     Equations,
     Refined,
     RefineOptions,
@@ -32,8 +31,9 @@ from roadgeo.matching.scene import Scene
 
 __all__ = ["measure_corners", "measured", "refine_beside", "with_honest_corners"]
 
-#: If this share of the mask's roads agrees, no cell of the frame was left out.
-_WHOLE = 0.9
+#: If this share of the mask's roads agrees, no cell of the frame was left out; and the part of that share that a fit to
+#: all cells may lose.
+_WHOLE, _LEAST_LOST = 0.9, 0.03
 #: Corners are moved one by one by this distance, to see whether the fit comes back: metres in the middle of the frame,
 #: and at least this number of pixels; the number of road points of such fits; and the most rounds.
 _BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = 24.0, 8.0, 150, 5
@@ -67,7 +67,7 @@ def measure_corners(estimator: TripleEstimator, best: Place) -> Place:
             best = _fit_whole_frame(estimator, best)
         best, scene = _fit_between_carriageways(estimator, best)
         for _ in range(_MOST_ROUNDS if doubtful else 0):
-            beside = refine_beside(best, scene, estimator.refine_options)
+            beside = refine_beside(best, scene, estimator.refinement(best))
             if beside is None or not estimator.may_be(beside.matrix):
                 break
             best = _moved(best, beside)
@@ -93,18 +93,18 @@ def _with_corners(place: Place, scene: Scene, options: RefineOptions) -> Place:
 
 def _fit_whole_frame(estimator: TripleEstimator, best: Place) -> Place:
     """Refine a place with all cells of the frame, if about as much of the mask's roads agrees then."""
-    options = replace(estimator.refine_options, least_share=0.0)
+    options = replace(estimator.refinement(best), least_share=0.0)
     whole = refine(best.matrix, best.scene, best.index, best.matched, options, held=True)
     if whole is None or not estimator.may_be(whole.matrix):
         return best
     moved = _moved(best, whole)
-    return moved if moved.agreement.forward >= best.agreement.forward - LITTLE else best
+    return moved if moved.agreement.forward >= best.agreement.forward - _LEAST_LOST else best
 
 
 def _fit_between_carriageways(estimator: TripleEstimator, best: Place) -> tuple[Place, Scene]:
     """Fit the middle of a mask's two roads to the map's single road; return the scene with road points there, too."""
     assert best.refined is not None  # noqa: S101 - what is measured was refined
-    between, scene = refine_between(best.refined, best.scene, best.index, best.matched, estimator.refine_options)
+    between, scene = refine_between(best.refined, best.scene, best.index, best.matched, estimator.refinement(best))
     if scene is best.scene or not estimator.may_be(between.matrix):
         return best, best.scene
     return _moved(best, between), scene

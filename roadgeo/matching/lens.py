@@ -11,7 +11,7 @@ from roadgeo._arrays import BoolArray, FloatArray
 from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.structs import Held
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.refinement import LITTLE, NO_PAIRS, Equations, Refined, RefineOptions
+from roadgeo.matching.refinement import NO_PAIRS, Equations, Refined, RefineOptions
 from roadgeo.matching.scene import Scene
 from roadgeo.roads.intersections import Intersections
 
@@ -26,6 +26,8 @@ __all__ = [
 
 #: No other fit is tried if this share of the mask's roads agrees.
 ENOUGH = 0.8
+#: Least gain in the share of road points on roads for a fit without a lens that grew over more of the frame.
+_BETTER = 0.02
 #: Significance of k1 in its standard deviations, and the least movement of the frame's corners, pixels.
 _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 #: Cells along each side of the frame; the part of the best cell's share of road points on roads that cells need where a
@@ -66,7 +68,7 @@ def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refineme
     """
     before = Equations(matrix, scene, index, refinement).meet().mean()
     fitted = fit_lens(matrix, scene, index, refinement, None)
-    return fitted if fitted is not None and fitted.share > before + LITTLE else None
+    return fitted if fitted is not None and fitted.share > before + _BETTER else None
 
 
 def fit_lens(

@@ -20,7 +20,6 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = [
-    "LITTLE",
     "NO_PAIRS",
     "Equations",
     "RefineOptions",
@@ -39,8 +38,9 @@ __all__ = [
 #: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
 #: Cauchy weights.
 _SIGMA_M, _SIGMA_PX = 1.2, 0.9
-#: Weight of a matched intersection relative to an independent road point, for its centre is less certain.
-_INTERSECTION_WEIGHT = 0.3
+#: Weight of a matched intersection relative to an independent road point, for its centre is less certain. A match takes
+#: part if at least this share of its neighbours are matched.
+_INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
 #: Errors of the map and of the mask are correlated over about this length of road, metres: closer points are not
@@ -57,8 +57,6 @@ _N_ITERATIONS, _TOLERANCE_M = 15, 0.02
 #: Accuracy of the map, metres, and of the mask, pixels, as a whole, which no number of points improves: lines are drawn
 #: and thinned to whole pixels. Fitted to the corners of training masks.
 _SIGMA_FLOOR = (0.1, 0.15)
-#: A share of the road points that makes no difference between fits.
-LITTLE = 0.02
 #: Prior standard deviation of k1.
 _K1_SIGMA = 0.1
 #: No matched intersections.
@@ -294,7 +292,11 @@ def refine(
     """
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     equations = Equations(matrix, scene, index, options or RefineOptions(), step=step)
+    # Isolated matches are probably accidental.
     chosen = matched >= 0
+    around = scene.neighbours[chosen]
+    support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
+    chosen[chosen] = support >= _LEAST_SUPPORT
     pairs = equations.pairs(scene.intersections.xy[chosen], index.xy[matched[chosen]], _INTERSECTION_WEIGHT)
     grid = _grid(6 if held or len(pairs.query) < _FEW_MATCHES else 0)
     weight = 8.0 / 36.0 * (equations.sigma_m / max(_HELD[0], _HELD[1] * equations.gsd)) ** 2
@@ -313,6 +315,8 @@ _APART_M, _MERGED = (3.0, 30.0), 0.35
 _BESIDE = 0.55
 #: Intersections within this multiple of the step belong to such a road: the map has them in the middle too.
 _NEAR = 2.0
+#: A smaller share of the points does not bend a fit.
+_FEW = 0.03
 #: The middle depends on the fit, and the fit on the middle: first about this many points are used, then all.
 _ROUNDS = (200, None)
 
@@ -353,7 +357,7 @@ def between_carriageways(
     reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
     feet = [_nearest(start, along, reach, index) for start in (at, at + across)]
     merged = np.hypot(*(feet[0] - feet[1]).T) < _MERGED * apart  # False for NaN
-    if merged.mean() < LITTLE:
+    if merged.mean() < _FEW:
         return scene, matched
     points = scene.points.copy()
     points[merged] = Homography(matrix).inverse().everywhere(at[merged] + 0.5 * across[merged])

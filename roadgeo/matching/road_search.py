@@ -159,7 +159,7 @@ def _draw(index: ReferenceIndex) -> RoadRaster:
 _LEAST_DENSITY = 0.005
 _PER_RADIAN = WHOLE_TURN / math.tau
 _TURN_STEPS = np.radians(3.0 * np.arange(-2, 3))
-_SCALE_STEPS = np.sqrt([1.0 / RING_STEP, RING_STEP])  # half a step of scale, either way
+_SCALE_STEPS = np.array([0.96, 1.04])
 
 #: Roads nearer than this, metres, that run straight away from the intersection, with at least this cosine, are left
 #: out: they are its own branches, which agree by construction. The right place then stands out more.
