@@ -34,7 +34,7 @@ settings.load_profile("steady")
 
 #: Seconds of processors of each slow test, of its programs, too; `--measure` renews it.
 SECONDS = Path(__file__).with_name("seconds.json")
-SLOW_S = 1.0
+SLOW_S = 2.0
 
 #: Left to the night, with all that is slow or needs one of the fixtures below: how the names of these tests begin.
 NIGHTLY = (

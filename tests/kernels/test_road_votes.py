@@ -104,7 +104,7 @@ def world(seed, n_places=30):
 
 
 class TestVote:
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize(("middle", "max_off"), [(0.0, math.pi), (0.0, 0.8), (3.0, 0.8)])
     def test_like_the_twin(self, seed, middle, max_off):
         n_places = 300 if max_off > 3 else 900
