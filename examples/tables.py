@@ -15,6 +15,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ import join  # noqa: E402
 import photographs  # noqa: E402
 import results  # noqa: E402
 
-from roadgeo.location import ERROR_RATES, Kind  # noqa: E402
+from roadgeo.location import ERROR_RATES, ErrorRate, Kind  # noqa: E402
 
 PAGE = EXAMPLES.parent / "docs" / "how-well.md"
 BENCH = EXAMPLES / "results" / "bench.json"
@@ -101,14 +102,21 @@ def trust_table() -> Iterator[str]:
     """Yield the lines of the table of scores: of each kind of query, how many places were reported, how many wrong."""
     yield "| query | score | reported | wrong |"
     yield "|---|---|---|---|"
-    for kind, rates in ERROR_RATES.items():
-        searches = reported(kind)
+    for kind in ERROR_RATES:
+        rates = counted(kind)
         for rate, above in zip(rates, [*rates[1:], None], strict=True):
             band = f"{rate.score:g} and more" if above is None else f"{rate.score:g} to {above.score:g}"
-            inside = [right for score, right in searches if rate.score <= score < (above.score if above else math.inf)]
-            wrong = inside.count(False)
-            at_most = 100 * results.interval(wrong, len(inside))[1]
-            yield f"| {kind} | {band} | {len(inside):,} | {wrong} (at most {at_most:.3g} %) |"
+            yield f"| {kind} | {band} | {rate.reported:,} | {rate.wrong} (at most {100 * rate.at_most:.3g} %) |"
+
+
+def counted(kind: Kind) -> list[ErrorRate]:
+    """Count `ERROR_RATES` of a kind anew, in its bands."""
+    searches, edges = reported(kind), [*(rate.score for rate in ERROR_RATES[kind]), math.inf]
+    rights = [[right for score, right in searches if low <= score < high] for low, high in pairwise(edges)]
+    return [
+        ErrorRate(score, len(band), band.count(False), results.interval(band.count(False), len(band))[1])
+        for score, band in zip(edges, rights, strict=False)
+    ]
 
 
 def reported(kind: Kind) -> list[tuple[float, bool]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from roadgeo.evaluation.demo import ROADS
+from roadgeo.location import ERROR_RATES, Kind
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -34,7 +35,7 @@ def test_correlation_with_heading_and_scale_finds_clean_masks(tmp_path: Path) ->
 
 
 def test_the_tables_of_how_well_are_those_of_the_code(tmp_path: Path) -> None:
-    """The bands of the odds; and a bench's output becomes a table."""
+    """The table of error rates; and a bench's output becomes a table."""
     subprocess.run([sys.executable, str(EXAMPLES / "tables.py"), "--check"], cwd=tmp_path, check=True)
     kind = {"masks": 8, "right": 7, "wrong": 0, "cpu_s": [0.1]}
     kind |= {"corners_m": [0.5, 1.25], "error_over_claim": [0.9, 1.1]}
@@ -43,6 +44,13 @@ def test_the_tables_of_how_well_are_those_of_the_code(tmp_path: Path) -> None:
     lines = list(tables["bench_table"]({"this": {"clean": kind, "turned over": absent}}))
     assert lines[2].endswith("| 7 of 8 | 0 | 0.5 m / 1.2 m | 0.90, 1.10 | 0.1 |")
     assert lines[3] == "| mirrored: no place |  | 0 of 8 |  |  | 0.1 |"
+
+
+@pytest.mark.parametrize("kind", ERROR_RATES)
+def test_the_error_rates_that_results_state_are_those_counted(kind: Kind) -> None:
+    counted = runpy.run_path(str(EXAMPLES / "tables.py"))["counted"](kind)
+    assert [rate[:3] for rate in counted] == [rate[:3] for rate in ERROR_RATES[kind]]
+    assert [rate.at_most for rate in counted] == pytest.approx([rate.at_most for rate in ERROR_RATES[kind]], abs=5e-4)
 
 
 def test_the_bench_compares_two_checkouts_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

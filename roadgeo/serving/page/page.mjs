@@ -114,7 +114,8 @@ async function finish(entry, job) {
   try {
     const { location } = await ask(`${entry.base}/results`);
     const seen = await ask(`${entry.base}/view.json`).catch(() => null);  // there was no room for it on the server's disk
-    update(entry, { document: location, view: seen, status: location.status, message: [location.reason, ...(location.error_rate ? [location.error_rate.said] : [])].join("; ") });
+    const message = [location.reason, location.error_rate?.said].filter(Boolean).join("; ");
+    update(entry, { document: location, view: seen, status: location.status, message });
   } catch (problem) {
     update(entry, { status: "failed", message: problem.message });
   }
