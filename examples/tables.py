@@ -2,8 +2,8 @@
 
 `results/bench.json` is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one
 counts. The other tables count the searches that `examples/trust`, `examples/photographs`, `examples/company` and
-`examples/peers` keep in their `results`. Bands of the score are those of `roadgeo.location.ERROR_RATES`, which a test
-holds against the table. `--check` writes nothing, and fails if a table would change.
+`examples/peers` keep in their `results`. The bands of the score come from `roadgeo.location.ERROR_RATES`, which a test
+counts anew. `--check` writes nothing, and fails if a table would change.
 """
 
 from __future__ import annotations

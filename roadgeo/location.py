@@ -38,7 +38,7 @@ SCHEMA = "roadgeo.location/1"
 
 Status = Literal["located", "ambiguous", "not_located", "chosen", "error"]
 
-#: What a place rests on: a photograph; roads and hints; the probability of road at each pixel; or roads alone.
+#: The evidence for a place: a photograph; roads and hints; the probability of road at each pixel; or roads alone.
 Kind = Literal["photograph", "hints", "soft mask", "mask"]
 
 
@@ -67,7 +67,7 @@ class ErrorRate(NamedTuple):
         return f"of such places at most 1 in {math.floor(n / 10**digits) * 10**digits:,} is wrong"
 
 
-#: Of each kind, by bands of the score, from the threshold on; a test counts them again in the results of `examples`.
+#: By kinds of query, and by bands of the score, from the threshold on; a test counts them again in the results of `examples`.
 ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
     "mask": (
         ErrorRate(3.5, 21, 2, 0.304),
@@ -147,7 +147,7 @@ class Content:
     stated : (lon, lat) or None
         Its middle by its own georeference.
     kind : Kind
-        What places rest on.
+        The evidence for its places.
     """
 
     size: tuple[int, int]

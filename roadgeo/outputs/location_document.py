@@ -96,7 +96,7 @@ def _from_document(document: dict[str, Any]) -> Location:
 
 
 def _kind(document: dict[str, Any]) -> Kind:
-    """Return what places rest on; only a rate of errors depends on it."""
+    """Return the evidence for its places; only a rate of errors depends on it."""
     kind = (document.get("error_rate") or {}).get("kind")
     return kind if kind in ERROR_RATES else "mask"
 

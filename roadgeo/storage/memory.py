@@ -48,7 +48,7 @@ def bounded(
     Raises
     ------
     RoadgeoError
-        Of the class `fault`: the block takes more.
+        The block takes more; the class is `fault`.
     """
     held, thread = _held_bytes() if before is None else before, threading.get_ident()
     if held is None or thread in _bounds or not (is_inside() or MEMORY in os.environ):
