@@ -67,7 +67,7 @@ class ErrorRate(NamedTuple):
         return f"of such places at most 1 in {math.floor(n / 10**digits) * 10**digits:,} is wrong"
 
 
-#: By kinds of query, and by bands of the score, from the threshold on; a test counts them again in the results of `examples`.
+#: By kinds of query, and by bands of the score, from the threshold on; a test counts them again in `examples`.
 ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
     "mask": (
         ErrorRate(3.5, 21, 2, 0.304),
