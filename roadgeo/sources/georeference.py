@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +15,7 @@ from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
 from roadgeo.sources.exif import read_position
 from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
-from roadgeo.storage.rasters import open_raster, read_beside, read_sidecar
+from roadgeo.storage.rasters import open_raster, read_beside, read_sidecar, sidecar_attributes
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -117,29 +118,37 @@ def _crs_beside(path: Path) -> str | None:
                 return name_crs(stated)
             except CrsError as error:
                 raise CrsError(f"{beside}: {error}") from error
-    stated = read_sidecar(path, "SRS")
+    points = sidecar_attributes(path, "GCPList")
+    stated = read_sidecar(path, "SRS") or read_sidecar(path, "WKT")  # of GDAL, of ArcGIS
+    stated = stated or (points[0].get("Projection", "") if points else "")
     return name_crs(stated) if stated else None
 
 
 def _of_raster(raster: DatasetReader) -> tuple[str, FloatArray] | None:
-    points = raster.gcps[0]
     if not raster.transform.is_identity:
         return "geotransform", np.array(raster.transform, float).reshape(3, 3)
-    if len(points) < 3:
-        return None
-    pixels = np.array([[point.col, point.row] for point in points], float)
-    return "control points", fit_place(pixels, np.array([[p.x, p.y] for p in points], float), len(points) >= 5)
+    return _of_points([(point.col, point.row, point.x, point.y) for point in raster.gcps[0]])
+
+
+def _of_points(points: Sequence[Sequence[float]]) -> tuple[str, FloatArray] | None:
+    """Fit a place to control points: column, row, x, y each; None to fewer than three."""
+    pixels, there = np.hsplit(np.array(points, float).reshape(-1, 4), 2)
+    return ("control points", fit_place(pixels, there, len(points) >= 5)) if len(points) >= 3 else None
 
 
 def _of_files_beside(path: Path) -> tuple[str, FloatArray | None]:
     """Read what a world file says, or a picture's `.aux.xml`."""
     placed, stated = _of_world_file(path), read_sidecar(path, "GeoTransform")
-    if placed is not None or not stated:
+    if placed is not None:
         return "world file", placed
     try:
+        if not stated:
+            points = sidecar_attributes(path, "GCP")
+            keys = ("Pixel", "Line", "X", "Y")
+            return _of_points([[float(point[key]) for key in keys] for point in points]) or ("world file", None)
         x, a, b, y, d, e = (float(word) for word in stated.split(","))
-    except ValueError as error:
-        raise MaskError(f"{path}.aux.xml: no geotransform; expected six numbers") from error
+    except (ValueError, KeyError) as error:
+        raise MaskError(f"{path}.aux.xml: no geotransform or control points; expected numbers") from error
     return "geotransform", np.array([[a, b, x], [d, e, y], [0.0, 0.0, 1.0]])
 
 

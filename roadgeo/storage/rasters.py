@@ -57,6 +57,7 @@ __all__ = [
     "read_sidecar",
     "require_file",
     "require_there",
+    "sidecar_attributes",
     "sidecar_nodata",
     "value_bands",
     "writing_raster",
@@ -288,8 +289,19 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
 
 def read_sidecar(path: str | os.PathLike[str], name: str) -> str:
     """Return the text of an element in the `.aux.xml` beside a raster; "" without one. No more is taken of it."""
-    match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", read_beside(path, Path(os.fspath(path) + ".aux.xml")))
+    match = re.search(rf"<{name}\b[^<>]*+>([^<]++)</", _sidecar(path))
     return html.unescape(match[1]).strip() if match else ""
+
+
+def sidecar_attributes(path: str | os.PathLike[str], name: str) -> list[dict[str, str]]:
+    """Return the attributes of each element of a name in the `.aux.xml` beside a raster."""
+    elements = re.findall(rf"<{name}\b([^<>]*+)", _sidecar(path))
+    stated = (re.findall(r'(\w++)="([^"]*+)"', element) for element in elements)
+    return [{key: html.unescape(value) for key, value in pairs} for pairs in stated]
+
+
+def _sidecar(path: str | os.PathLike[str]) -> str:
+    return read_beside(path, Path(os.fspath(path) + ".aux.xml"))
 
 
 def read_beside(path: str | os.PathLike[str], beside: Path) -> str:
@@ -301,7 +313,8 @@ def read_beside(path: str | os.PathLike[str], beside: Path) -> str:
         It takes too much memory.
     """
     with bounded(path, MaskError):
-        return beside.read_text("utf-8", "replace") if beside.is_file() else ""
+        stored = beside.read_bytes() if beside.is_file() else b""
+        return stored.decode("utf-16" if stored[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
 
 
 #: Suffixes of images, which no text has.

@@ -31,6 +31,10 @@ def at(place: rasterio.Affine, column: float, row: float) -> tuple[float, float]
     return a * column + b * row + c, d * column + e * row + f
 
 
+def spread(place: rasterio.Affine) -> list[tuple[float, float, float, float]]:
+    return [(column, row, *at(place, column, row)) for column, row in [(0, 0), (80, 0), (80, 60), (0, 60)]]
+
+
 BLACK = np.zeros((60, 80), np.uint8)
 WORLD_FILE = "0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n"
 
@@ -120,6 +124,24 @@ def test_a_prj_beside_a_world_file_names_its_crs(tmp_path: Path, version: str) -
         read_georeference(path)
 
 
+@pytest.mark.parametrize("written", ["utf-8-sig", "utf-16", "utf-16-be", "crlf"])
+@pytest.mark.parametrize("of", ["pgw", "prj", "png.aux.xml"])
+def test_files_beside_a_picture_are_text_as_programs_write_it(tmp_path: Path, of: str, written: str) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), BLACK)
+    texts = {"pgw": WORLD_FILE, "prj": pyproj.CRS(32619).to_wkt("WKT1_ESRI")}
+    if of == "png.aux.xml":
+        crs, numbers = texts["prj"], ", ".join(map(str, PLACE.to_gdal()))
+        texts = {of: f"<PAMDataset>\n<SRS>{crs}</SRS>\n<GeoTransform>{numbers}</GeoTransform>\n</PAMDataset>"}
+    for name, text in texts.items():
+        encoding = written if name == of and written != "crlf" else "utf-8"
+        mark = "\ufeff" if encoding == "utf-16-be" else ""
+        (tmp_path / f"a.{name}").write_bytes((mark + text.replace("\n", "\r\n")).encode(encoding))
+    found = read_georeference(tmp_path / "a.png")
+    assert found is not None
+    assert found.crs == "EPSG:32619"
+    assert found.matrix == pytest.approx(np.array(PLACE).reshape(3, 3), abs=1e-9)
+
+
 @pytest.mark.parametrize("orientation", [3, 6, 7])
 def test_a_world_file_speaks_of_stored_pixels(tmp_path: Path, orientation: int) -> None:
     path = save_turned(tmp_path / "scan.png", np.zeros((60, 80), np.uint8), orientation)
@@ -160,7 +182,11 @@ SHIFTED = {
 
 
 @pytest.mark.parametrize(
-    "where", ["geotransform", "control points", "turned", "jp2", "img", "prj", "aux.xml", "aux.xml and world file"]
+    "where",
+    [
+        *("geotransform", "control points", "turned", "jp2", "img", "prj", "aux.xml", "aux.xml and world file"),
+        *("aux.xml of control points", "aux.xml of ArcGIS"),
+    ],
 )
 @pytest.mark.parametrize("name", SHIFTED)
 def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: str) -> None:
@@ -177,8 +203,7 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
         with kept:
             path = write(tmp_path / f"a.{where}", crs=named, transform=place, **driver)
     elif where in ("control points", "turned"):
-        spots = [(0, 0), (80, 0), (80, 60), (0, 60)]
-        points = [GroundControlPoint(row, column, *at(place, column, row)) for column, row in spots]
+        points = [GroundControlPoint(row, column, x, y) for column, row, x, y in spread(place)]
         with kept:
             path = write(tmp_path / "a.tif", gcps=points, crs=named)
         if where == "turned":
@@ -186,16 +211,19 @@ def test_the_datum_shift_of_a_crs_is_its_own(tmp_path: Path, name: str, where: s
     else:
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), BLACK)
-        if where != "aux.xml":
+        if "points" not in where and where != "aux.xml":
             path.with_suffix(".wld").write_text(f"{step}\n0\n0\n{-step}\n{west + step / 2}\n{north - step / 2}\n")
         if where == "prj":
             path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_GDAL"))
         else:
             numbers = ", ".join(map(str, place.to_gdal())) if where == "aux.xml" else ""
-            Path(f"{path}.aux.xml").write_text(
-                f'<PAMDataset><SRS dataAxisToSRSAxisMapping="1,2">{html.escape(crs.to_wkt("WKT1_GDAL"))}</SRS>'
-                f"<GeoTransform> {numbers}</GeoTransform></PAMDataset>"
-            )
+            wkt = html.escape(crs.to_wkt("WKT1_GDAL"))
+            points = (f'<GCP Id="" Pixel="{u}" Line="{v}" X="{x!r}" Y="{y!r}"/>' for u, v, x, y in spread(place))
+            stated = {
+                "aux.xml of control points": f'<GCPList Projection="{wkt}">{"".join(points)}</GCPList>',
+                "aux.xml of ArcGIS": f"<Metadata><SpatialReference><WKT>{wkt}</WKT></SpatialReference></Metadata>",
+            }.get(where, f'<SRS dataAxisToSRSAxisMapping="1,2">{wkt}</SRS><GeoTransform> {numbers}</GeoTransform>')
+            Path(f"{path}.aux.xml").write_text(f"<PAMDataset>{stated}</PAMDataset>")
     found = read_georeference(path)
     assert found is not None
     middle = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform(*at(place, 40, 30))
