@@ -46,12 +46,16 @@ _LOG = log_of(__name__)
 _USUAL_RATE = 25.0
 _LONG_S = 3600.0  # no flight is filmed with a gap of this length: another clock begins
 _HEAD_BYTES = 4096
-#: Times in names: a date; seconds since 1970, with digits of a fraction, or milli-, micro- or nanoseconds; seconds with
-#: a fraction behind a point.
+#: Times in names: a date; seconds since 1970, with digits of a fraction, or milli-, micro- or nanoseconds; a time of day,
+#: or seconds, with a fraction.
 _TIMES = (
-    re.compile(r"(?<!\d)((?:19|20)\d\d-?\d\d-?\d\d[-_T ]?\d\d[-:]?\d\d[-:]?\d\d)(?:\.(\d{1,9}))?(?!\d)"),
-    re.compile(r"(?<![\d.])(1\d{9})\.?(\d{3}|\d{6}|\d{9})?$"),
-    re.compile(r"^(?:.*[^\d.-])?(-?\d{1,10})\.(\d{1,9})(?:s|sec|seconds)?$"),
+    re.compile(
+        r"(?<!\d)((?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?: at |[-_T ])?\d\d[-_:.h]?\d\d[-_:.m]?\d\d)"
+        r"(?:(?:[.,s]|(?=(?:\d{3}){1,3}(?!\d)))(\d{1,9}))?(?!\d)"
+    ),
+    re.compile(r"(?<![\d.])(1\d{9})[._]?(\d{3}|\d{6}|\d{9})?(?![\d.,])"),
+    re.compile(r"(?<!\d)(\d\d[-_:.h]\d\d[-_:.m]\d\d)[.,s](\d{1,9})$"),
+    re.compile(r"^(?:.*[^\d.,-])?(-?\d{1,10})[.,](\d{1,9})(?:s|sec|seconds)?$"),
 )
 _WHOLE_SHARE = 0.95  # of the frames that a container states: some only estimate their number
 
@@ -235,21 +239,25 @@ def _by_time(paths: list[str], options: FrameOptions) -> tuple[list[str], list[f
 
 
 def _named_times(paths: Sequence[str]) -> list[float]:
-    """Return the times in the names of images, seconds: dates, or the only number; none where not all have one."""
+    """Return the times in the names of images, seconds; none where not all have one.
+
+    Where more than the time varies, as in recordings one after another, it has to rise from name to name.
+    """
     for pattern in _TIMES:
-        matches = [pattern.search(Path(path).stem) for path in paths]
-        read = [_time_of(*match.groups()) for match in matches if match is not None]
-        times = [time for time in read if time is not None]
-        if len(times) == len(paths) and len({*times}) > 1:
+        matches = [match for path in paths if (match := pattern.search(Path(path).stem))]
+        times = [time for match in matches if (time := _time_of(*match.groups())) is not None]
+        rests = {match.string[: match.start(1)] + match.string[match.end() :] for match in matches}
+        if len(times) == len(paths) and len({*times}) > 1 and (len(rests) == 1 or times == sorted(times)):
             return times
     return []
 
 
 def _time_of(whole: str, part: str | None) -> float | None:
-    """Return seconds, or since 1970 of a date; None of a date that there is not."""
-    if len(digits := re.sub(r"\D", "", whole)) == 14:
+    """Return seconds, since midnight of a time of day, or since 1970 of a date; None of a date that there is not."""
+    digits = re.sub(r"\D", "", whole)
+    if len(digits) == 14 or re.search(r"\d\D", whole):
         with suppress(ValueError):
-            moment = datetime.strptime(digits, "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+            moment = datetime.strptime(("19700101" + digits)[-14:], "%Y%m%d%H%M%S").replace(tzinfo=UTC)
             return moment.timestamp() + float(f"0.{part or 0}")
         return None
     return float(f"{whole}.{part or 0}")
@@ -295,6 +303,8 @@ def _video(
         yield _FrameFile(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, aspect, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
+    if taken == 1 < k:
+        _LOG.warning("%s: lasts %.2g s: one frame of %d is taken; --every SECONDS takes more", name, at_s + step_s, k)
     stated = video.get(cv2.CAP_PROP_FRAME_COUNT)
     if k < _WHOLE_SHARE * stated:
         _LOG.warning("%s: ends after %d of the %d frames that it states: it may be cut off", name, k, stated)

@@ -286,6 +286,18 @@ NAMED = {
     "dates": (["20240611_235958", "20240611_235959", "20240612_000001"], [0.0, 1.0, 3.0]),
     "dates and numbers": ([f"DJI_2024061110450{k}_000{n}_V" for n, k in enumerate("1337")], [0.0, 2.0, 2.5, 6.0]),
     "dates as ISO has them": (["2024-06-11T10-45-01.250", "2024-06-11T10-45-03.000"], [0.0, 1.75]),
+    "dates of players": ([f"vlcsnap-2024-05-01-09h30m0{time}" for time in ("0s500", "1s250")], [0.0, 0.75]),
+    "dates of phones": (["PXL_20240501_093000250", "PXL_20240501_093001000"], [0.0, 0.75]),
+    "dates of screens": (["Shot 2024-05-01 at 09.30.00", "Shot 2024-05-01 at 09.30.05"], [0.0, 5.0]),
+    "times of day": (["shot_00_01_02.500", "shot_00_01_03.250", "shot_00_02_00.000"], [0.0, 0.75, 57.5]),
+    "times of day in letters": (["a-00h01m59s500", "a-00h02m00s250"], [0.0, 0.75]),
+    "decimal commas": (["t_9,5", "t_10,25", "t_10,5"], [0.0, 0.75, 1.0]),
+    "since 1970, and a camera": (["1699999999.123456_left", "1699999999.623456_left"], [0.0, 0.5]),
+    "seconds and nanoseconds": (["a_1699999999_123456789", "a_1699999999_623456789"], [0.0, 0.5]),
+    "numbers and seconds": (["frame_0001_12.5", "frame_0002_13.25"], [0.0, 0.75]),
+    "clocks that restart": (["a_0.5", "a_1.5", "b_0.5", "b_1.5"], [0.0, 1.0, 2.0, 3.0]),
+    "clocks of two cameras": (["cam1_0.5", "cam1_1.5", "cam2_0.5"], [0.0, 1.0, 2.0]),
+    "no times of day": (["shot_00_75_02.500", "shot_00_76_00.000"], [0.0, 1.0]),
     "numbers": (["frame_1", "frame_2", "frame_7"], [0.0, 1.0, 2.0]),
     "one has none": (["1.5", "2.0", "last"], [0.0, 1.0, 2.0]),
     "no dates": (["20241399_104501", "20241399_104509"], [0.0, 1.0]),
@@ -328,6 +340,26 @@ def test_pages_and_animations_are_frames(tmp_path: Path, suffix: str) -> None:
     assert [(frame.name, frame.time_s) for frame in read] == [(name, float(k)) for k, name in enumerate(names)]
     for frame, picture in zip(read, shown, strict=True):
         np.testing.assert_array_equal(frame.mask.roads, picture > 127)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "png", "avi"])
+def test_a_video_that_is_shorter_than_a_step_is_mentioned(
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "avi":
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240))
+        for _ in range(3):
+            writer.write(np.full((240, 320, 3), 255, np.uint8))
+        writer.release()
+    else:
+        first, *others = map(PIL.Image.fromarray, [streets(), streets()[::-1].copy(), streets()[:, ::-1].copy()])
+        first.save(path, save_all=True, append_images=others, duration=100)
+    assert len(list(read_frames([str(path)]))) == 1
+    assert "one frame of 3 is taken; --every SECONDS takes more" in caplog.text
+    caplog.clear()
+    assert len(list(read_frames([str(path)], FrameOptions(every_s=0.0)))) == 3
+    assert "--every" not in caplog.text
 
 
 def test_names_in_the_order_of_text_are_mentioned(masks: list[str], caplog: pytest.LogCaptureFixture) -> None:
