@@ -46,8 +46,8 @@ _LOG = log_of(__name__)
 _USUAL_RATE = 25.0
 _LONG_S = 3600.0  # no flight is filmed with a gap of this length: another clock begins
 _HEAD_BYTES = 4096
-#: Times in names: a date; seconds since 1970, with digits of a fraction, or milli-, micro- or nanoseconds; a time of day,
-#: or seconds, with a fraction.
+#: Times in names: a date; seconds since 1970, with digits of a fraction, or milli-, micro- or nanoseconds; a time of
+#: day, or seconds, with a fraction.
 _TIMES = (
     re.compile(
         r"(?<!\d)((?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?: at |[-_T ])?\d\d[-_:.h]?\d\d[-_:.m]?\d\d)"
