@@ -68,6 +68,7 @@ _ELSEWHERE = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save it as CSV with a column of WKT, or as GeoPackage"),
     **dict.fromkeys((".xz", ".7z", ".rar", ".tar", ".tgz", ".zst"), "packed in a way that is not read; unpack it"),
 }
+_CURVES = "a column holds curves, which are not read: make lines of them (ogr2ogr -nlt CONVERT_TO_LINEAR, ST_CurveToLine)"
 _EXPECTED = (
     "expected a path, a GeoDataFrame, a GeoSeries, a table of pandas, polars or pyarrow with a column of WKB or WKT, "
     "a graph of osmnx or momepy, shapely lines, or arrays of coordinates of shape (N, 2)"
@@ -384,12 +385,16 @@ def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
     import shapely
 
     first = next((value for value in values if value is not None), b"")
-    if isinstance(first, str) and not _HEX.fullmatch(first[:64]):
-        srid = _SRID.match(first)
-        texts = [value and _SRID.sub("", value) for value in values]
-        return np.asarray(shapely.from_wkt(texts, on_invalid="ignore")), int(srid[1]) if srid else 0
-    packed = [bytes(value) if isinstance(value, bytearray | memoryview) else value for value in values]
-    shapes = np.asarray(shapely.from_wkb(packed, on_invalid="ignore"))
+    is_text = isinstance(first, str) and not _HEX.fullmatch(first[:64])
+    stated = _SRID.match(first) if is_text else None
+    try:
+        if is_text:
+            texts = [value and _SRID.sub("", value) for value in values]
+            return np.asarray(shapely.from_wkt(texts, on_invalid="ignore")), int(stated[1]) if stated else 0
+        packed = [bytes(value) if isinstance(value, bytearray | memoryview) else value for value in values]
+        shapes = np.asarray(shapely.from_wkb(packed, on_invalid="ignore"))
+    except NotImplementedError as error:
+        raise RoadSourceError(_CURVES) from error
     return shapes, max(0, *shapely.get_srid(shapes).tolist()) if len(shapes) else 0
 
 

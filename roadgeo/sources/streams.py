@@ -276,9 +276,10 @@ def reading(path: Path, unpacked: str | None = None) -> Iterator[None]:
     try:
         yield
     except RoadSourceError as error:
-        if unpacked is None or unpacked not in str(error):
+        said = str(error).replace(unpacked or str(path), str(path))
+        if said == str(error) and str(path) in said:
             raise
-        raise type(error)(str(error).replace(unpacked, str(path))) from error
+        raise type(error)(said if str(path) in said else f"{path}: {said}") from error
     except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
         # Many libraries read such files, and a damaged one may make them raise anything.
         raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error

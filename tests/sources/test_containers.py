@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import sqlite3
+import struct
 from pathlib import Path
 
 import geopandas as gpd
@@ -182,6 +183,31 @@ def test_tables_of_any_library_give_the_same_roads(tmp_path: Path, library: str,
     right = choose_roads(gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs=CRS))
     assert shapely.hausdorff_distance(found.lines, right.lines).max() < 1e-6
     assert found.kinds.tolist() == right.kinds.tolist()
+
+
+#: A curve as other programs write it, for shapely holds none.
+ARC = bytes.fromhex("010800000003000000" + struct.pack("<6d", 0, 0, 1, 1, 2, 0).hex())
+CURVES = {
+    "WKB": ARC,
+    "WKB in digits": ARC.hex().upper(),
+    "WKT": "CIRCULARSTRING (0 0,1 1,2 0)",
+    "WKT of PostGIS": "SRID=4326;COMPOUNDCURVE ((0 0,1 0),CIRCULARSTRING (1 0,1 1,2 0))",
+    "WKT with M": "MULTICURVE M (CIRCULARSTRING M (1 0 1,1 1 1,2 0 1))",
+}
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("library", [*TABLES, *FILES])
+def test_curves_in_a_column_are_refused(tmp_path: Path, library: str, curve: str) -> None:
+    if curve == "WKB" and library.endswith((".csv", ".csv.gz", ".sqlite")):
+        pytest.skip("kept as text")
+    columns = {"highway": ["residential"] * 2, "geometry": [CURVES[curve]] * 2}
+    with pytest.raises(RoadSourceError, match="holds curves.*ogr2ogr -nlt CONVERT_TO_LINEAR") as raised:
+        if library in FILES:
+            FILES[library](columns, tmp_path / library)
+            choose_roads(tmp_path / library, crs=4326)
+        choose_roads(TABLES[library](columns), crs=4326)
+    assert str(raised.value).startswith(str(tmp_path / library) if library in FILES else "a column")
 
 
 @pytest.mark.parametrize("encoding", ["WKB", "geoarrow"])
