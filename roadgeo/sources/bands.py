@@ -75,6 +75,8 @@ class Bands:
         Threshold of a map of probability that we wrote.
     option : str
         The option that chooses a band, before its number; "" of an array, of which one is given.
+    is_lossy : bool
+        Values are about those that were saved, as of JPEG.
     """
 
     name: str
@@ -87,6 +89,7 @@ class Bands:
     page: str = ""
     model_threshold: float | None = None
     option: str = "--band "
+    is_lossy: bool = False
 
     @property
     def n_unread(self) -> int:
@@ -177,8 +180,13 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
 
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
-    size, own = (dataset.height, dataset.width), _model_threshold(dataset)
-    return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page, own)
+    size, own, structure = (
+        (dataset.height, dataset.width),
+        _model_threshold(dataset),
+        dataset.tags(ns="IMAGE_STRUCTURE"),
+    )
+    is_lossy = "JPEG_QUALITY" in structure or structure.get("COMPRESSION_REVERSIBILITY") == "LOSSY"
+    return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page, own, is_lossy=is_lossy)
 
 
 def _half_opaque(dataset: DatasetReader, band: int) -> int:

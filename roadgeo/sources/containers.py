@@ -68,7 +68,7 @@ _ELSEWHERE = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save it as CSV with a column of WKT, or as GeoPackage"),
     **dict.fromkeys((".xz", ".7z", ".rar", ".tar", ".tgz", ".zst"), "packed in a way that is not read; unpack it"),
 }
-_CURVES = "a column holds curves, which are not read: make lines of them (ogr2ogr -nlt CONVERT_TO_LINEAR, ST_CurveToLine)"
+_CURVES = "a column holds curves; expected lines: make some of them (ogr2ogr -nlt CONVERT_TO_LINEAR, ST_CurveToLine)"
 _EXPECTED = (
     "expected a path, a GeoDataFrame, a GeoSeries, a table of pandas, polars or pyarrow with a column of WKB or WKT, "
     "a graph of osmnx or momepy, shapely lines, or arrays of coordinates of shape (N, 2)"

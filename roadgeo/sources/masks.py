@@ -211,6 +211,12 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
         )
     threshold = threshold if number is None else number
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
+    if len(thresholds) > 1 and raster.is_lossy:
+        _LOG.warning(
+            "%s: is read as a soft map, road above %g; numbers of roads, blurred by JPEG, would look so, too: "
+            "save them without loss, or give --threshold",
+            *(raster.name, thresholds[0]),
+        )
     levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
     return MaskSource(thresholds, raster, channel, voids, levels, _part_of(raster, observed, channel, choice))
 

@@ -202,11 +202,11 @@ def test_curves_in_a_column_are_refused(tmp_path: Path, library: str, curve: str
     if curve == "WKB" and library.endswith((".csv", ".csv.gz", ".sqlite")):
         pytest.skip("kept as text")
     columns = {"highway": ["residential"] * 2, "geometry": [CURVES[curve]] * 2}
-    with pytest.raises(RoadSourceError, match="holds curves.*ogr2ogr -nlt CONVERT_TO_LINEAR") as raised:
-        if library in FILES:
-            FILES[library](columns, tmp_path / library)
-            choose_roads(tmp_path / library, crs=4326)
-        choose_roads(TABLES[library](columns), crs=4326)
+    given = tmp_path / library if library in FILES else TABLES[library](columns)
+    if library in FILES:
+        FILES[library](columns, given)
+    with pytest.raises(RoadSourceError, match=r"holds curves.*ogr2ogr -nlt CONVERT_TO_LINEAR") as raised:
+        choose_roads(given, crs=4326)
     assert str(raised.value).startswith(str(tmp_path / library) if library in FILES else "a column")
 
 

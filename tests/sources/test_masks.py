@@ -779,6 +779,7 @@ def numbered(roads: np.ndarray, kind: str, length: int = 12) -> np.ndarray:
         "many": 40 + 11 * bands,
         "lanes": 1 + bands % 3,
         "speeds": np.array([30, 50, 90])[bands % 3],
+        "far apart": np.array([20, 120, 250])[bands % 3],
         "years": 1990 + bands,
         "float years": 1990.0 + bands,
         "miles": np.array([30, 50, 90])[bands % 3] * 1.609,
@@ -787,7 +788,7 @@ def numbered(roads: np.ndarray, kind: str, length: int = 12) -> np.ndarray:
     return (roads * numbers).astype(types.get(kind, "uint8"))
 
 
-NUMBERED = ["instances", "many", "lanes", "speeds", "years", "float years", "miles"]
+NUMBERED = ["instances", "many", "lanes", "speeds", "far apart", "years", "float years", "miles"]
 
 
 @pytest.mark.parametrize("container", ["array", "tif", "png", "nodata", "masked", "rgb", "colours", "palette"])
@@ -838,14 +839,15 @@ def test_numbers_that_are_saved_with_loss_are_road(
     assert "a number for each of its roads" in caplog.text
 
 
-@pytest.mark.parametrize("kind", ["instances", "lanes"])
+@pytest.mark.parametrize("kind", ["instances", "lanes", "far apart"])
 def test_numbers_that_loss_makes_a_soft_map_of_are_told_or_refused(
     kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     values = numbered(streets(), kind, 60)
-    for suffix, quality in itertools.product(("jpg", "webp"), (50, 75, 95)):
+    for suffix, quality in itertools.product(("jpg", "webp", "tif", "jp2"), (50, 75, 95)):
         caplog.clear()
-        PIL.Image.fromarray(values).save(tmp_path / f"a.{suffix}", quality=quality)
+        lossy = {"tif": {"compression": "jpeg"}, "jp2": {"quality_layers": [100 - quality], "irreversible": True}}
+        PIL.Image.fromarray(values).save(tmp_path / f"a.{suffix}", quality=quality, **lossy.get(suffix, {}))
         try:
             read_mask(tmp_path / f"a.{suffix}", voids=False)
         except MaskError as error:
