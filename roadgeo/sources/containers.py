@@ -386,7 +386,7 @@ def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
 
     first = next((value for value in values if value is not None), b"")
     is_text = isinstance(first, str) and not _HEX.fullmatch(first[:64])
-    stated = _SRID.match(first) if is_text else None
+    stated = _SRID.match(str(first)) if is_text else None
     try:
         if is_text:
             texts = [value and _SRID.sub("", value) for value in values]
