@@ -51,7 +51,7 @@ def name_crs(crs: Any) -> str:
     resolved = resolved.to_2d() if len(resolved.axis_info) == 3 else resolved
     if not (resolved.is_geographic or resolved.is_projected):
         raise NoCrsError(f"{text} is no CRS of a map, but a {resolved.type_name}; {expected}")
-    code = resolved.to_epsg(min_confidence=100)
+    code = _code(resolved)
     return f"EPSG:{code}" if code else resolved.to_wkt("WKT2_2019")
 
 
@@ -61,6 +61,11 @@ def crs_name(crs: Any) -> str | None:
         return None if crs is None else name_crs(crs)
     except NoCrsError:
         return None
+
+
+@lru_cache(maxsize=64)  # where PROJ has none it compares its whole list, for up to 50 ms
+def _code(crs: CRS) -> int | None:
+    return crs.to_epsg(min_confidence=100)
 
 
 @lru_cache(maxsize=64)

@@ -27,7 +27,10 @@ PAGES = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 }
-LINKING = [path for path in sorted(ROOT.rglob("*.md")) if not {".venv", "build", ".pytest_cache"} & set(path.parts)]
+LINKING = [
+    *ROOT.glob("*.md"),
+    *(path for one in ROOT.glob("[!.]*/") if one.name != "build" for path in one.rglob("*.md")),
+]
 
 #: Blocks that are not run with their page, by how they begin: .ci/run takes the first two from README.md and runs them
 #: on clean copies of this repository; for what runs inside QGIS see `test_the_commands_for_qgis_run_there`.
@@ -99,7 +102,7 @@ def desk(shelf, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_does_what_it_says(page: str, desk: Path, request: pytest.FixtureRequest) -> None:
     """Its blocks run in order in one folder, end as it says, print what it shows, and leave the files it names."""
-    if re.search("roadgeo[_ ]demo", PAGES[page]) and "\nroadgeo demo\n" not in PAGES[page]:
+    if re.search("roadgeo_demo|`roadgeo demo", PAGES[page]) and "\nroadgeo demo\n" not in PAGES[page]:
         shutil.copytree(request.getfixturevalue("demonstrated"), desk / "roadgeo_demo")
     left_out = {block.line for block in blocks(PAGES[page]) if block.text.startswith(ELSEWHERE)}
     with fake_osm() as osm:
