@@ -29,7 +29,7 @@ from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import N_LIKELIEST, Rivals
 from roadgeo.matching.road_search import COARSE_PIXEL_M, make_raster
 from roadgeo.matching.scene import Query
-from roadgeo.matching.search import Ahead, Search, search_together
+from roadgeo.matching.search import Ahead, Search, search_each, search_together
 from roadgeo.matching.triples import larger, n_units
 from roadgeo.storage.memory import let_pages_go
 
@@ -218,9 +218,15 @@ def _search_alone(
         list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
     searches = {Search(estimator): estimator for estimator in estimators}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
-    work_s = options.search.work_limit_s * sum(n_units(len(estimator.index)) for estimator in estimators)
-    limits = replace(options.search, time_limit_s=time_limit_s, work_limit_s=work_s)
-    search_together(list(searches), limits, rivals.leading, _name_maps(searches, say))
+    limits = {
+        search: replace(
+            options.search,
+            time_limit_s=time_limit_s,
+            work_limit_s=options.search.work_limit_s * n_units(len(estimator.index)),
+        )
+        for search, estimator in searches.items()
+    }
+    search_each(limits, rivals.stands, rivals.promise, _name_maps(searches, say))
     for estimator in estimators:
         estimator.sweeps.end()
     return searches

@@ -28,6 +28,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import CameraFault, judge
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
+from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture, by_picture
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import refine
@@ -106,6 +107,7 @@ class Rivals:
         self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
         self._compared: dict[tuple[Place, ...], Place] = {}  # by the place and those that were met
+        self._last: dict[Search[Place], tuple[int, Place | None]] = {}  # with how many places the part had then
 
     def __call__(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
         """Return the part whose likeliest place leads all others by twice the score needed, or None."""
@@ -117,9 +119,22 @@ class Rivals:
             return None
         return None if any(self._rivals(part, place) for part in parts if part is not best) else best
 
-    def leading(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
-        """Return a part whose likeliest place leads all others of the same part by twice the score needed, or None."""
-        return next((part for part in parts if part.best is not None and self([part]) is not None), None)
+    def stands(self, part: Search[Place]) -> bool:
+        """Return whether a part of a map that is searched alone has the answer.
+
+        Its likeliest place leads all others of the part by twice the score needed; or, where nothing of the map is left
+        to search, a place leads by the score needed, for no better version or rival of it can come.
+        """
+        if part.best is not None and self([part]) is not None:
+            return True
+        index = self.estimators[part].index
+        own = [it for it, estimator in self.estimators.items() if _is_of_map(index, estimator.index)]
+        places = map(self.compare, own) if all(it.stopped for it in own) else ()
+        return any(place is not None and place.score >= self.needed for place in places)
+
+    def promise(self, part: Search[Place]) -> float:
+        """Return what the likeliest place of a part explains, in scores needed."""
+        return max((place.log10_likelihood for place in self.estimators[part].verified), default=0.0) / self.needed
 
     def _rivals(self, part: Search[Place], best: Place) -> bool:
         """Return whether another part has another place that explains nearly as much as the best place of all."""
@@ -131,6 +146,13 @@ class Rivals:
 
     def compare(self, part: Search[Place]) -> Place | None:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
+        verified = self.estimators[part].verified
+        if part not in self._last or self._last[part][0] < len(verified):
+            place = self._by_roads_and_picture(part)
+            self._last[part] = len(verified), place
+        return self._last[part][1]
+
+    def _by_roads_and_picture(self, part: Search[Place]) -> Place | None:
         by_roads, estimator = self._among_equals(part), self.estimators[part]
         is_drawn = estimator.scene.probability is None
         if by_roads is None or by_roads.score >= _CERTAIN or is_drawn or time.perf_counter() > self._deadline:
@@ -256,6 +278,10 @@ class Rivals:
         matrix = rival.matrix  # type: ignore[union-attr]
         verified = next((place for place in ranked if place.matrix is matrix), None)
         return verified or estimator.settle(Place(estimator.scene, estimator.index, matrix))[0]
+
+
+def _is_of_map(index: ReferenceIndex, other: ReferenceIndex) -> bool:
+    return index.is_of_map(other) or index.is_shard_beside(other)
 
 
 def _is_beaten(place: Place) -> bool:

@@ -1,20 +1,22 @@
 """The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it.
 
-The loop drives a problem, or many parts of a problem: breadth first, a little of every part at each stage. It ends when
-an answer stands out from all others, whichever parts they come from. Without such an answer it ends after a limit of
-work, which is counted, so that a busy machine finds the same as an idle machine; the clock is the last resort.
+The loop drives a problem, or many parts of a problem. Together: breadth first, a little of every part at each stage,
+until an answer stands out from all others, whichever parts they come from. Each alone: the most promising part first,
+until an answer stands out on its own part. Without such an answer it ends after a limit of work, which is counted, so
+that a busy machine finds the same as an idle machine; the clock is the last resort.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search_together"]
+__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search_each", "search_together"]
 
 
 Model = TypeVar("Model")
@@ -88,8 +90,8 @@ class Search(Generic[Model]):
     stopped : str
         Why it ended: "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
         ended the search.
-    seconds : float
-        Time spent on this part.
+    seconds, work_s : float
+        Time, and work, spent on this part.
     """
 
     def __init__(self, estimator: Estimator[Model]) -> None:
@@ -99,7 +101,7 @@ class Search(Generic[Model]):
         self.stage = 0
         self.ended = False
         self.stopped = ""
-        self.seconds = 0.0
+        self.seconds = self.work_s = 0.0
         self._charged_s = estimator.work
         self._stages = estimator.stages()
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
@@ -131,6 +133,7 @@ class Search(Generic[Model]):
         """Subtract the work done since the last call from the work left."""
         work = self.estimator.work
         budget.left_s -= work - self._charged_s
+        self.work_s += work - self._charged_s
         self._charged_s = work
 
 
@@ -138,16 +141,18 @@ def search_together(
     parts: Sequence[Search[Model]],
     options: SearchOptions | None = None,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None = None,
-    heard: Callable[[Search[Model]], None] = lambda _: None,
 ) -> None:
     """Search many parts until an answer stands out on all parts, they are exhausted, or a limit is reached.
 
     Each part does a round in turn, stage after stage: the hypotheses of a sample of the query are met on all parts
     before an answer is accepted. `proves` returns the part whose answer stands out from all others, or None. It is
     called when an answer reaches `SearchOptions.accept`, which is enough without it, and at the end of each stage.
-    `heard` is called with each part before its round.
     """
-    ended_by = _search(parts, options or SearchOptions(), proves, heard)
+    _end(parts, _search_together(parts, options or SearchOptions(), proves))
+
+
+def _end(parts: Sequence[Search[Model]], ended_by: str) -> None:
+    """Tell each part why it ended."""
     for part in parts:
         if ended_by in ("work", "time") and not part.ended:
             part.stopped = ended_by
@@ -155,11 +160,10 @@ def search_together(
             part.stopped = part.stopped or ("exhausted" if part.ended else "elsewhere")
 
 
-def _search(
+def _search_together(
     parts: Sequence[Search[Model]],
     options: SearchOptions,
     proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None,
-    heard: Callable[[Search[Model]], None],
 ) -> str:
     """Search until an answer is accepted; return why the search ended."""
     budget, stage = _Budget(options), 0
@@ -173,7 +177,6 @@ def _search(
     while not all(part.ended for part in parts):
         while here := [part for part in parts if part.stage == stage and not part.ended]:
             for part in here:
-                heard(part)
                 part.advance(budget)
                 if spent := budget.spent:
                     return spent
@@ -184,6 +187,36 @@ def _search(
             return "accepted"
         stage += 1
     return "exhausted"
+
+
+def search_each(
+    parts: Mapping[Search[Model], SearchOptions],
+    proves: Callable[[Search[Model]], bool],
+    promise: Callable[[Search[Model]], float],
+    heard: Callable[[Search[Model]], None] = lambda _: None,
+) -> None:
+    """Search each part as if it were alone, within its own limits, until the answer of one stands out.
+
+    Parts share the work as 10 to the power of their `promise`, a log10: a small map does not wait for large ones, and
+    where an answer shows, its map is searched first. `proves` returns whether a part has the answer. It is called when
+    the best model reaches `SearchOptions.accept`, and at the end of each stage. `heard` is called with each part before
+    its round.
+    """
+    budgets = {part: _Budget(options) for part, options in parts.items()}
+    done = dict.fromkeys(parts, -math.inf)  # log10 of the work done, less the promise
+    while left := [part for part in parts if not part.stopped]:
+        part = min(left, key=done.__getitem__)
+        stage = part.stage
+        heard(part)
+        part.advance(budgets[part])
+        part.stopped = budgets[part].spent or ("exhausted" if part.ended else "")
+        if (part.score >= parts[part].accept or part.stage > stage or part.stopped) and proves(part):
+            part.stopped = "accepted"
+        if part.stopped in ("accepted", "time"):
+            break
+        done[part] = (math.log10(part.work_s) if part.work_s else -math.inf) - promise(part)
+    for part in left:
+        part.stopped = part.stopped or ("time" if budgets[part].spent == "time" else "elsewhere")
 
 
 Item = TypeVar("Item")

@@ -256,6 +256,23 @@ def test_a_place_on_another_part_is_a_rival_unless_it_is_the_same(broken, monkey
     assert (proved is not None) is is_same
 
 
+@pytest.mark.parametrize(("lead", "shard_left", "stands"), [(1.1, "", True), (0.9, "", False), (1.1, "other", False)])
+def test_a_map_that_was_searched_to_its_end_needs_no_double_lead(broken, monkeypatch, lead, shard_left, stands):
+    """Nothing of it is left to hold a rival; where a shard of it is left, one may come."""
+    (item, estimator), (beside_it, other) = search_of(broken, broken[0]), search_of(broken, broken[0])
+    item.best = estimator.verified[0]
+    monkeypatch.setattr(other, "index", replace(other.index, meta=dict(other.index.meta)))  # a map of its own
+    if shard_left:
+        for one in (estimator, other):
+            monkeypatch.setitem(one.index.meta, "shard_of", "a large map")
+    asked = Rivals({item: estimator, beside_it: other}, Ledger(n_reference=866), NEEDED)
+    place = item.best.but(score=lead * NEEDED)
+    monkeypatch.setattr(Rivals, "_among_equals", lambda self, part: place)
+    assert not asked.stands(item)  # it may go on
+    item.stopped = "exhausted"
+    assert asked.stands(item) == stands
+
+
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     item, estimator = search_of(broken, broken[0])
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)

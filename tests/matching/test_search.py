@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import pytest
 from worlds.scenes import search
 
-from roadgeo.matching.search import Search, SearchOptions, search_together
+from roadgeo.matching.search import Search, SearchOptions, search_each, search_together
 
 
 @dataclass
@@ -152,20 +152,58 @@ def test_many_parts_share_one_time_limit():
     assert max(len(toy.scored) for toy in toys) - min(len(toy.scored) for toy in toys) <= 1
 
 
+def test_work_that_was_done_together_is_not_charged_again():
+    toy = Toy([[(k, 1.0)] for k in range(30)], scored=list(range(100)))
+    together(toy, options=SearchOptions(work_limit_s=10.0))
+    assert len(toy.scored) == 110
+
+
 # --- each part as if it were alone ------------------------------------------------------------------------------------
+
+
+def each(*toys, options=None, promise=lambda part: 0.0, heard=lambda part: None):
+    parts = [Search(toy) for toy in toys]
+    limits = dict.fromkeys(parts, options or SearchOptions(work_limit_s=1e9))
+    search_each(limits, lambda part: part.score >= 8.0, promise, heard)
+    return parts
 
 
 def test_parts_take_turns_until_one_stands_out_on_its_own():
     toys = [InStages([[(10 * n + k, 1.0)] for k in range(3)]) for n in range(3)]
     toys[1].plan[1] = [(17, 9.0)]
     toys[2].plan[0] = [(20, 7.9)]  # does not lead its own part, and is no rival
-    parts = [Search(toy) for toy in toys]
-    search_together(parts, proves=lambda parts: next((part for part in parts if part.score >= 8.0), None))
-    assert [len(toy.scored) for toy in toys] == [2, 2, 2]
+    parts = each(*toys)
+    assert [len(toy.scored) for toy in toys] == [2, 2, 1]
     assert [part.stopped for part in parts] == ["elsewhere", "accepted", "elsewhere"]
 
 
-def test_work_that_was_done_together_is_not_charged_again():
-    toy = Toy([[(k, 1.0)] for k in range(30)], scored=list(range(100)))
-    together(toy, options=SearchOptions(work_limit_s=10.0))
-    assert len(toy.scored) == 110
+def test_a_small_map_does_not_wait_for_large_ones():
+    """A round of a large map does more work; the small one, searched to the end meanwhile, has the answer."""
+    large = Toy([[(100 * n + k, 1.0) for k in range(10)] for n in range(1, 9)])
+    small = Toy([[(1, 1.0)], [(2, 1.0)], [(3, 9.0)]])
+    parts = each(large, small)
+    assert (len(large.scored), len(small.scored)) == (10, 3)
+    assert [part.stopped for part in parts] == ["elsewhere", "accepted"]
+
+
+def test_work_is_shared_as_ten_to_the_power_of_the_promise():
+    toys = [Toy([[(1000 * n + k, 1.0)] for k in range(1000)]) for n in range(3)]
+    toys[2].plan[200] = [(1, 9.0)]
+    promise = {id(toy): float(n > 0) for n, toy in enumerate(toys)}
+    each(*toys, promise=lambda part: promise[id(part.estimator)])
+    assert [len(toy.scored) for toy in toys] == pytest.approx([20, 200, 201], abs=1)
+
+
+def test_each_part_has_its_own_limit_of_work():
+    toys = [Toy([[(100 * n + k, 1.0)] for k in range(50)]) for n in range(2)]
+    toys[1].plan = toys[1].plan[:5]
+    parts = each(*toys, options=SearchOptions(work_limit_s=20.0))
+    assert [len(toy.scored) for toy in toys] == [20, 5]
+    assert [part.stopped for part in parts] == ["work", "exhausted"]
+
+
+def test_the_clock_ends_all_parts_and_each_is_heard_before_its_round():
+    toys, heard = [Toy([[(k, 1.0)] for k in range(100)], seconds=0.03) for _ in range(3)], []
+    parts = each(*toys, options=SearchOptions(time_limit_s=0.05), heard=heard.append)
+    assert {part.stopped for part in parts} == {"time"}
+    assert len(heard) == sum(len(toy.scored) for toy in toys) < 9
