@@ -123,7 +123,8 @@ class Schema:
         tunnels = [in_tunnel(_each(values[row], _words)) for values in hidden]
         called = next((columns[name] for name in _NAMES if name in columns), None)
         counts = {"no_roads": len(others) - len(np.unique(of)), "broken": _count_broken(shapes)}
-        by = " and ".join(name for name, _ in self.kinds)
+        filled = [name for name in _OTHERS if any(map(is_filled, columns.get(name, ())))]
+        by = " and ".join([*dict(self.kinds), *filled])
         stated = {"attribution": self.attribution, "kind_columns": by if self.is_guess else "", **table.meta, **counts}
         return RoadLines(
             lines,
@@ -260,7 +261,7 @@ def _words(value: Any) -> str:
 def is_filled(value: Any) -> bool:
     """Whether a value of a table is one, and no word for none."""
     if isinstance(value, str):
-        return value.strip().lower() not in ("", "no", "none", "nan", "null")
+        return value.strip().lower() not in ("", "no", "none", "nan", "null", "<null>")
     if isinstance(value, tuple | list | np.ndarray | set):
         return len(value) > 0
     return value is not None and type(value).__name__ not in ("NAType", "NaTType") and value == value

@@ -229,17 +229,19 @@ def _unpacked(path: Path, folder: Path) -> list[Path]:
 
 def tell_source(name: str, meta: Mapping[str, Any]) -> None:
     """Report the parts of a source that were left out, or are not known."""
+    by = f", by its column {meta['kind_columns']}; --kinds all keeps them" if meta.get("kind_columns") else ""
     reasons = {
-        "no_roads": "are no roads: streams, railways, fences, or not built",
+        "no_roads": f"are no roads: streams, railways, fences, or not built{by}",
+        **({"other_kinds": f"are of other kinds{by}"} if by else {}),
         "broken": "have a vertex that is not finite",
         "without_places": "are ways whose nodes are not in the file",
         "astray": "lie beyond the Earth, or have a vertex at 0, 0 far off all others",
     }
     for key, what in reasons.items():
         if meta.get(key):
-            by = f", by its column {meta['kind_columns']}; --kinds all keeps them" if meta.get("kind_columns") else ""
-            counts = f"{meta[key]:,}", f"{meta['features']:,}"
-            _LOG.warning("%s: left out %s of %s features, which %s", name, *counts, what + by * (key == "no_roads"))
+            _LOG.warning(
+                "%s: left out %s of %s features, which %s", name, f"{meta[key]:,}", f"{meta['features']:,}", what
+            )
     tell_state(name, meta)
     if meta.get("without_kind"):
         kindless, kept = f"{meta['without_kind']:,}", f"{meta['kept']:,}"

@@ -171,13 +171,28 @@ def test_words_of_other_columns_are_no_kinds(tmp_path, name, container, caplog):
     assert "left out" not in caplog.text
 
 
-def test_a_column_that_is_believed_is_named_and_all_keeps_all(tmp_path, caplog):
+@pytest.mark.parametrize("container", ["gpkg", "shp", "geojson", "parquet", "frame"])
+@pytest.mark.parametrize(
+    ("name", "words", "what"),
+    [
+        ("art", ["tertiary", "motorway", "river"], "no roads: streams, railways, fences, or not built"),
+        ("railway", [None, None, "rail"], "no roads: streams, railways, fences, or not built"),
+        ("landuse", [None, "", "forest"], "no roads: streams, railways, fences, or not built"),
+        ("usage", ["Tertiary", "Residential", "Footway"], "of other kinds"),
+        ("usage", ["Tertiary", "<Null>", "Pedestrian"], "of other kinds"),
+    ],
+)
+def test_a_column_that_is_believed_is_named_and_all_keeps_all(tmp_path, name, words, what, container, caplog):
     shapes = [shapely.LineString([(k, 0), (k, 1)]) for k in (0.0, 0.01, 0.02)]
-    path = write_vector(tmp_path / "a.gpkg", shapes, art=["tertiary", "motorway", "river"])
-    assert len(choose_roads(path)) == 2
-    assert "left out 1 of 3 features, which are no roads" in caplog.text
-    assert "by its column art; --kinds all keeps them" in caplog.text
-    assert len(choose_roads(path, "all")) == 3
+    table = gpd.GeoDataFrame({name: words}, geometry=shapes, crs=4326)
+    if container == "parquet":
+        table.to_parquet(tmp_path / "a.parquet")
+    elif container != "frame":
+        write_vector(tmp_path / f"a.{container}", shapes, **{name: words})
+    source = table if container == "frame" else tmp_path / f"a.{container}"
+    assert len(choose_roads(source)) == 2
+    assert f"left out 1 of 3 features, which are {what}, by its column {name}; --kinds all keeps them" in caplog.text
+    assert len(choose_roads(source, "all")) == 3
 
 
 @pytest.mark.parametrize(
