@@ -321,30 +321,24 @@ def what_is_missing(path: Path, n_features: int) -> str:
 
 def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> Iterator[RoadTable]:
     """Stream Parquet by batches of its row groups, with or without the metadata of GeoParquet."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        with pq.ParquetFile(path) as file:
-            _require_rows(file.metadata.num_rows, path.stat().st_size)
-            shape_column, crs, encoding = _declared(file.schema_arrow) or _shapes_by_values(file)
-            names = [name for name in file.schema_arrow.names if name != shape_column]
-            leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
-        wanted = [name for name in names if is_known_column(name)] or names
-        wanted = [name for name in names if name in wanted or name.lower() in _LEVELS]
-        text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
-        done = 0
-        with pq.ParquetFile(path, read_dictionary=text) as file:
-            for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
-                columns = {name: objects(batch[name].to_pylist()) for name in wanted}
-                shapes, srid = _shapes(batch, shape_column, encoding)
-                yield RoadTable(shapes, crs or srid or None, columns, {"format": "Parquet"})
-                done += len(batch)
-                advance(done / file.metadata.num_rows)
-    except pa.ArrowMemoryError as error:
-        raise MemoryError(str(error)) from error
-    except (ValueError, TypeError, LookupError, pa.ArrowException, OSError) as error:  # of its text, when looked at
-        raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
+    with pq.ParquetFile(path) as file:
+        _require_rows(file.metadata.num_rows, path.stat().st_size)
+        shape_column, crs, encoding = _declared(file.schema_arrow) or _shapes_by_values(file)
+        names = [name for name in file.schema_arrow.names if name != shape_column]
+        leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
+    wanted = [name for name in names if is_known_column(name)] or names
+    wanted = [name for name in names if name in wanted or name.lower() in _LEVELS]
+    text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+    done = 0
+    with pq.ParquetFile(path, read_dictionary=text) as file:
+        for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
+            columns = {name: objects(batch[name].to_pylist()) for name in wanted}
+            shapes, srid = _shapes(batch, shape_column, encoding)
+            yield RoadTable(shapes, crs or srid or None, columns, {"format": "Parquet"})
+            done += len(batch)
+            advance(done / file.metadata.num_rows)
 
 
 def _require_rows(rows: int, size: int) -> None:
@@ -415,14 +409,9 @@ def _shapes(batch: Any, column: str, encoding: str) -> tuple[AnyArray, int]:
 
 def _read_graphml(path: Path) -> RoadTable:
     """Read a street network that osmnx saved."""
-    import xml.etree.ElementTree as ET
-
     import networkx as nx
 
-    try:
-        table = _graph_table(nx.read_graphml(path))
-    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
+    table = _graph_table(nx.read_graphml(path))
     return RoadTable(table.shapes, table.crs, table.columns, {"format": "GraphML", "attribution": OSM_ATTRIBUTION})
 
 
@@ -434,6 +423,15 @@ def held_table(roads: Any) -> RoadTable:
     RoadSourceError
         It is something else.
     """
+    try:
+        return _held(roads)
+    except (TypeError, ValueError, LookupError, RuntimeError) as error:
+        raise RoadSourceError(
+            f"roads of type {type(roads).__name__} cannot be read: {first_line(error)}; {_EXPECTED}"
+        ) from error
+
+
+def _held(roads: Any) -> RoadTable:
     import shapely
 
     if hasattr(roads, "edges") and hasattr(roads, "graph"):  # networkx
@@ -442,12 +440,9 @@ def held_table(roads: Any) -> RoadTable:
         return _arrow_table(roads)
     if hasattr(roads, "columns") and hasattr(roads, "iloc"):  # pandas
         return _held_columns(roads)
-    try:
-        is_single = isinstance(roads, shapely.Geometry) or (isinstance(roads, np.ndarray) and roads.ndim == 2)
-        listed = [roads] if is_single else list(roads)
-        shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
-    except (TypeError, ValueError) as error:
-        raise _unreadable(roads, str(error)) from error
+    is_single = isinstance(roads, shapely.Geometry) or (isinstance(roads, np.ndarray) and roads.ndim == 2)
+    listed = [roads] if is_single else list(roads)
+    shapes = [shape if shape is None or isinstance(shape, shapely.Geometry) else _line(shape) for shape in listed]
     return RoadTable(objects(shapes), getattr(roads, "crs", None))
 
 
@@ -455,14 +450,11 @@ def _arrow_table(roads: Any) -> RoadTable:
     """Return what any library hands over as Arrow does."""
     import pyarrow as pa
 
-    try:
-        table = pa.table(roads)
-        own, crs, encoding = _declared(table.schema) or ("", None, "")
-        shapes, srid = _shapes(table, own, encoding) if own else (np.empty(0, object), 0)
-    except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
-        raise _unreadable(roads, first_line(error)) from error
+    table = pa.table(roads)
+    own, crs, encoding = _declared(table.schema) or ("", None, "")
+    shapes, srid = _shapes(table, own, encoding) if own else (np.empty(0, object), 0)
     columns = {name: objects(table[name].to_pylist()) for name in table.column_names if name != own}
-    return RoadTable(shapes, crs or srid or None, columns) if own else _of_values(roads, columns)
+    return RoadTable(shapes, crs or srid or None, columns) if own else _of_values(columns)
 
 
 def _held_columns(roads: Any) -> RoadTable:
@@ -476,17 +468,14 @@ def _held_columns(roads: Any) -> RoadTable:
     if name is not None:
         shapes = objects(shape if isinstance(shape, shapely.Geometry) else None for shape in columns.pop(name))
         return RoadTable(shapes, getattr(roads, "crs", None), columns)
-    return _of_values(roads, columns)
+    return _of_values(columns)
 
 
-def _of_values(roads: Any, columns: dict[str, AnyArray]) -> RoadTable:
+def _of_values(columns: dict[str, AnyArray]) -> RoadTable:
     """Return a table of which a column, by its values, holds WKB or WKT."""
-    try:
-        taken = _take_shapes(columns)
-    except TypeError as error:
-        raise _unreadable(roads, "a column holds more than shapes") from error
+    taken = _take_shapes(columns)
     if taken is None:
-        raise _unreadable(roads, "none of its columns holds shapes")
+        raise ValueError("none of its columns holds shapes")
     return RoadTable(taken[0], taken[1] or None, columns)
 
 
@@ -497,10 +486,6 @@ def _take_shapes(columns: dict[str, AnyArray]) -> tuple[AnyArray, int] | None:
         if isinstance(first, bytes | bytearray | memoryview | str) and _read_shapes([first])[0][0] is not None:
             return _read_shapes([value if is_filled(value) else None for value in columns.pop(name)])
     return None
-
-
-def _unreadable(roads: Any, why: str) -> RoadSourceError:
-    return RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {why}; {_EXPECTED}")
 
 
 def _line(coordinates: Any) -> Any:
@@ -560,10 +545,7 @@ def _overpass_elements(path: Path) -> list[Any] | None:
     """Return the elements of an answer of Overpass as JSON; None: it is another file."""
     if b'"elements"' not in _ends(path, _ENDS_BYTES)[0]:
         return None
-    try:
-        answer = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise RoadSourceError(f"{path}: not readable as an answer of Overpass: {first_line(error)}") from error
+    answer = json.loads(path.read_bytes())
     elements = answer.get("elements") if isinstance(answer, dict) else None
     if elements is not None and answer.get("remark"):
         raise RoadSourceError(f"{path}: {GAVE_UP}: {str(answer['remark'])[:200].strip(' .')}; {ASK_LESS}")

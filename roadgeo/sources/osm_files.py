@@ -19,7 +19,6 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, line_through
 from roadgeo.storage.pbf import read_parts
 from roadgeo.storage.unpacking import read_chunks
-from roadgeo.storage.vectors import first_line
 
 __all__ = ["ASK_LESS", "GAVE_UP", "OSM_ENDINGS", "stream_ways"]
 
@@ -59,30 +58,27 @@ def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder:
     """
     import osmium
 
-    try:
-        deleted = set() if _is_pbf(path) else _deleted_ways(path)
-        first, _ = next(_parts(path))  # not the path: osmium forgets to close a damaged PBF file on disk
-        with osmium.io.Reader(first, osmium.osm.NOTHING) as reader:
-            header = reader.header()
-        stamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
-        meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"osm_timestamp": stamp} if stamp else {})
-        ways: list[_Way] = []
-        n_read = n_lost = 0
-        for way, line in _highways(path, header, advance, folder):
-            if way.tags.get("area") == "yes" or not way.visible or way.id in deleted:
-                continue
-            n_read += 1
-            if line is None:
-                n_lost += 1
-                continue
-            tags = way.tags
-            ways.append((line, tags["highway"], tags.get("tunnel"), tags.get("name") or tags.get("ref")))
-            if len(ways) == most:
-                yield _table(ways, n_read, n_lost, meta)
-                ways, n_read, n_lost = [], 0, 0
-        yield _table(ways, n_read, n_lost, meta)
-    except (RuntimeError, OSError, ValueError, osmium.InvalidLocationError) as error:
-        raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
+    deleted = set() if _is_pbf(path) else _deleted_ways(path)
+    first, _ = next(_parts(path))  # not the path: osmium forgets to close a damaged PBF file on disk
+    with osmium.io.Reader(first, osmium.osm.NOTHING) as reader:
+        header = reader.header()
+    stamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
+    meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"osm_timestamp": stamp} if stamp else {})
+    ways: list[_Way] = []
+    n_read = n_lost = 0
+    for way, line in _highways(path, header, advance, folder):
+        if way.tags.get("area") == "yes" or not way.visible or way.id in deleted:
+            continue
+        n_read += 1
+        if line is None:
+            n_lost += 1
+            continue
+        tags = way.tags
+        ways.append((line, tags["highway"], tags.get("tunnel"), tags.get("name") or tags.get("ref")))
+        if len(ways) == most:
+            yield _table(ways, n_read, n_lost, meta)
+            ways, n_read, n_lost = [], 0, 0
+    yield _table(ways, n_read, n_lost, meta)
 
 
 def _table(ways: Sequence[_Way], n_read: int, n_lost: int, meta: dict[str, Any]) -> RoadTable:

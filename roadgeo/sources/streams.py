@@ -271,9 +271,6 @@ def tell_state(name: str, meta: Mapping[str, Any]) -> None:
 @contextmanager
 def reading(path: Path, unpacked: str | None = None) -> Iterator[None]:
     """Turn what goes wrong with a road file, or with what is unpacked of it, into a `RoadSourceError` that names it."""
-    from pyproj.exceptions import ProjError
-    from shapely.errors import ShapelyError
-
     require_file(path)
     try:
         yield
@@ -282,6 +279,7 @@ def reading(path: Path, unpacked: str | None = None) -> Iterator[None]:
         if said == str(error) and str(path) in said:
             raise
         raise type(error)(said if str(path) in said else f"{path}: {said}") from error
-    except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
-        # Many libraries read such files, and a damaged one may make them raise anything.
+    except (RoadgeoError, MemoryError, ImportError):
+        raise
+    except Exception as error:  # many libraries read such files, and a damaged one may make them raise anything
         raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error
