@@ -43,8 +43,8 @@ _LAYERS = ("roads", "edges", "lines", "entities", "elements")
 _ONE_DRAWING = (".gpx", ".kml", ".kmz")
 #: Drawings, whose layers GDAL gives as a column of one layer; and its names, in tables made of drawings too.
 _DRAWINGS, _LEVELS = (".dxf", ".dgn", ".dwg"), ("layer", "level", "layername", "layer_name")
-#: Names of columns that hold shapes in a table that declares none, and types of their values.
-_SHAPES, _TEXTS = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt"), ("binary", "string")
+#: Names of columns that hold shapes in a table that declares none.
+_SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
 _SRID, _HEX = re.compile(r"\s*SRID\s*=\s*(\d{1,9})\s*;", re.IGNORECASE), re.compile(r"[0-9A-Fa-f]{18,}")
 _INIT = re.compile(r"\{'init': '(epsg:\d{1,9})'.*\}", re.IGNORECASE)  # a CRS as osmnx wrote it before 0.12
 _PEEK = 1000
@@ -321,22 +321,20 @@ def what_is_missing(path: Path, n_features: int) -> str:
 
 def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> Iterator[RoadTable]:
     """Stream Parquet by batches of its row groups, with or without the metadata of GeoParquet."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as file:
         _require_rows(file.metadata.num_rows, path.stat().st_size)
-        shape_column, crs, encoding = _declared(file.schema_arrow) or _shapes_by_values(file)
-        names = [name for name in file.schema_arrow.names if name != shape_column]
+        own, names = _declared(file.schema_arrow), file.schema_arrow.names
         leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
-    wanted = [name for name in names if is_known_column(name)] or names
-    wanted = [name for name in names if name in wanted or name.lower() in _LEVELS]
+    if own and any(map(is_known_column, names)):
+        names = [name for name in names if name == own[0] or is_known_column(name) or name.lower() in _LEVELS]
     text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
     done = 0
     with pq.ParquetFile(path, read_dictionary=text) as file:
-        for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
-            columns = {name: objects(batch[name].to_pylist()) for name in wanted}
-            shapes, srid = _shapes(batch, shape_column, encoding)
-            yield RoadTable(shapes, crs or srid or None, columns, {"format": "Parquet"})
+        for batch in file.iter_batches(most, columns=names):
+            yield replace(_arrow_table(pa.Table.from_batches([batch])), meta={"format": "Parquet"})
             done += len(batch)
             advance(done / file.metadata.num_rows)
 
@@ -361,17 +359,6 @@ def _declared(schema: Any) -> tuple[str, Any, str] | None:
             about = json.loads(extension.get(b"ARROW:extension:metadata") or "{}")
             return field.name, about.get("crs"), named.split(".")[1]
     return None
-
-
-def _shapes_by_values(file: Any) -> tuple[str, None, str]:
-    """Return the column of a Parquet file that holds shapes by its first values; the rest as `_declared` does."""
-    kinds = {field.name: str(field.type).removeprefix("large_").removesuffix("_view") for field in file.schema_arrow}
-    names = [name for name, kind in kinds.items() if kind in _TEXTS]
-    first = next(file.iter_batches(_PEEK, columns=names), None) if names else None
-    columns = {} if first is None else {name: objects(first[name].to_pylist()) for name in names}
-    if _take_shapes(columns) is None:
-        raise ValueError("it declares no geometry column, and none holds WKB or WKT")
-    return next(name for name in names if name not in columns), None, "WKB"
 
 
 def _read_shapes(values: Sequence[Any]) -> tuple[AnyArray, int]:
