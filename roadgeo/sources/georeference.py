@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +16,7 @@ from roadgeo.geometry.georeference import Georeference, fit_place, stretch_of
 from roadgeo.sources.exif import read_position
 from roadgeo.storage.crs import crs_name, name_crs
 from roadgeo.storage.orientation import read_orientation, read_resolution, stored_from_upright
-from roadgeo.storage.rasters import open_raster, read_beside, read_sidecar, sidecar_attributes
+from roadgeo.storage.rasters import open_raster, raster_size, read_beside, read_sidecar, sidecar_attributes
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 __all__ = ["Stated", "read_georeference", "read_stated"]
 
 _STEPS_ASIDE = 4  # orientations beyond this make rows of columns
-#: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
-_HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
 
 
 def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> Georeference | None:
@@ -42,15 +41,13 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     CrsError
         It has coordinates, but names no CRS.
     """
-    with open_raster(path) as raster:
-        size = (raster.width, raster.height)
+    with open_raster(path, upright=False) as raster:
         own = _crs_of(raster) if crs is None else name_crs(crs)
-        stated = _of_raster(raster)
-    source, matrix = stated or _of_files_beside(Path(path))
+        source, matrix = _of_raster(raster) or _of_files_beside(Path(path))
     if matrix is None:
         return None
-    if stated is None:  # files beside it speak of pixels as they are stored
-        matrix = matrix @ stored_from_upright(read_orientation(path), size)
+    size = raster_size(path)
+    matrix = matrix @ stored_from_upright(read_orientation(path), size)
     own = own or _crs_beside(Path(path))
     if own is None:
         raise CrsError(
@@ -95,12 +92,9 @@ def read_stated(path: str | os.PathLike[str]) -> Stated:
 
 def _stated(path: str | os.PathLike[str]) -> Georeference | None:
     """Return a raster's own georeference, or one of files beside it, where it has one."""
-    try:
-        with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-            may_hold = file.read(8).startswith(_HOLD_A_PLACE) or _of_files_beside(Path(path))[1] is not None
-        return read_georeference(path) if may_hold else None
-    except (MaskError, CrsError, OSError, ValueError):
-        return None
+    with suppress(MaskError, CrsError, OSError, ValueError):
+        return read_georeference(path)
+    return None
 
 
 def _crs_of(raster: DatasetReader) -> str | None:
