@@ -35,7 +35,7 @@ from roadgeo.sources.schemas import recognise
 from roadgeo.storage.crs import crs_name
 from roadgeo.storage.folders import cache_dir, writable
 from roadgeo.storage.memory import bounded
-from roadgeo.storage.vectors import first_line, read_layer
+from roadgeo.storage.vectors import read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 
@@ -174,10 +174,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     path = Path(polygon)
     layer = read_layer(path, None, ())
     shapes = objects([] if layer.shapes is None else layer.shapes)
-    try:
-        parts = simple_areas(shapely.from_wkb(shapes))
-    except shapely.errors.ShapelyError as error:
-        raise RoadSourceError(f"{path}: holds no shapes that can be read: {first_line(error)}") from error
+    parts = simple_areas(shapely.from_wkb(shapes, on_invalid="ignore"))
     if len(parts) == 0:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
     if part := what_is_missing(path, len(shapes)):

@@ -126,21 +126,13 @@ def mean_of(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
     first = maps[0]
     height, width = first.values.shape
     values = [item.resized((height, width)).values for item in maps]
-    mean = np.empty((height, width), np.uint8)
-    step = max(1, _STRIP_PIXELS // width)
-    for top in range(0, height, step):
-        mean[top : top + step] = _mean([value[top : top + step] for value in values])
-    return replace(first, values=mean)
-
-
-def _mean(values: Sequence[AnyArray]) -> AnyArray:
-    """Return the mean of the log odds of those (H, W) that observed a pixel, as a probability."""
     share = (np.arange(256, dtype=np.float32).clip(0, PROBABILITY_SURE) + 0.5) / 255
     log_odds: AnyArray = np.log(share / (1 - share)).astype(np.float32)
-    total, count = np.zeros(values[0].shape, np.float32), np.zeros(values[0].shape, np.float32)
-    for value in values:
-        observed = value != NODATA
-        total += np.where(observed, log_odds[value], 0)
-        count += observed
-    mean = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
-    return np.where(count > 0, np.rint(PROBABILITY_SURE * mean), NODATA).astype(np.uint8)
+    mean = np.empty((height, width), np.uint8)
+    step = max(1, _STRIP_PIXELS // width)
+    for rows in (slice(top, top + step) for top in range(0, height, step)):
+        seen = np.array([value[rows] for value in values])
+        count = (seen != NODATA).sum(axis=0, dtype=np.float32)
+        odds = np.where(seen != NODATA, log_odds[seen], 0).sum(axis=0) / np.maximum(count, 1)
+        mean[rows] = np.where(count > 0, np.rint(PROBABILITY_SURE * (1.0 / (1.0 + np.exp(-odds)))), NODATA)
+    return replace(first, values=mean)
