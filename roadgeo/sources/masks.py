@@ -309,7 +309,7 @@ def _of_two_colours(raster: Bands, observed: AnyArray) -> Bands:
 
     (n, B) values of a sample were observed.
     """
-    if observed.shape[1] != 3 or observed.dtype.kind not in "iu" or not np.ptp(observed, axis=1).any():
+    if observed.shape[1] != 3 or observed.dtype.kind not in "iu" or not _coloured(observed):
         return raster
     parts, axes = np.linalg.eigh(np.cov(observed.T.astype(np.float64)))
     axis = axes[:, -1] * (1.0 if axes[:, -1].sum() >= 0.0 else -1.0)
@@ -338,11 +338,16 @@ def _of_colours(raster: Bands) -> Bands:
     for ground in (0, np.iinfo(values.dtype).max):
         shown = (values != ground).any(axis=2) & _finite(values, valid)
         packed = values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]]
-        if np.ptp(values[shown], axis=1).any() and are_roads(shown) and are_patches(packed, shown):
+        if _coloured(values[shown]) and are_roads(shown) and are_patches(packed, shown):
             _LOG.warning("%s: holds a colour for each of its roads: all but its ground is road", raster.name)
             drawn = _changed(raster, partial(_unlike, ground))
             return replace(drawn, bands=raster.bands[:1])
     return raster
+
+
+def _coloured(values: AnyArray) -> bool:
+    """Whether any of (n, B) values are other than grey."""
+    return bool((values[:, 1:] != values[:, :1]).any())
 
 
 def _unlike(ground: int, values: AnyArray, valid: BoolArray | None) -> _Rows:

@@ -14,8 +14,8 @@ import tomllib
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from itertools import pairwise
+from functools import cache, lru_cache, partial
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,17 @@ __all__ = ["Schema", "is_filled", "is_known_column", "names_kinds", "recognise"]
 
 #: Meanings of a word beside values of `highway`: no road, and a road of a kind that other columns may hold.
 _NONE, _ROAD = "none", "road"
+_LONGEST = 200  # of words
 _LETTERS = str.maketrans({"ø": "o", "æ": "ae", "ß": "ss", "ð": "d", "ł": "l"})
 
 
 def _plain(text: str) -> str:
-    """Return a word in lower case, without accents and whatever is no letter or digit."""
+    """Return a word in lower case, without accents and whatever is no letter or digit; "" for one that is too long."""
+    return _letters_of(text) if len(text) <= _LONGEST else ""
+
+
+@lru_cache(maxsize=1 << 12)  # columns repeat a few words
+def _letters_of(text: str) -> str:
     text = text.lower().translate(_LETTERS)
     return "".join(letter for letter in unicodedata.normalize("NFKD", text) if letter.isascii() and letter.isalnum())
 
@@ -164,7 +170,7 @@ def recognise(table: RoadTable) -> Schema:
         if name in others and kinds:
             break
         maker, words = _words_of(columns[name], name in _SURE or (is_overture and name in _GENERAL))
-        if _share(columns[name], _CODES.get(name, {})) > 0.5:
+        if name in _CODES and _share(_said(columns[name]), _CODES[name]) > 0.5:
             kinds[name] = _CODES[name]
         elif maker:
             kinds[name], makers[name] = words, maker
@@ -203,30 +209,26 @@ def _words_of(values: AnyArray, sure: bool = False) -> tuple[str, Mapping[str, s
     In a column of a name that is not `sure`, all are where several of them can be nothing but roads; otherwise those
     that can be nothing else, if most are. "" without a maker.
     """
-    shares = {maker: _share(values, words) for maker, words in _WORDS.items()}
+    said = _said(values)
+    shares = {maker: _share(said, words) for maker, words in _WORDS.items()}
     best = max(shares, key=lambda maker: shares[maker])
     if shares[best] <= 0.5:
         return "", {}
-    said = {_plain(word) for value in _sample(values) for word in _split(value)}
-    n_roads = len({word for word in said if _CERTAIN[best].get(word, _NONE) != _NONE})
+    n_roads = len({word for word in map(_plain, chain(*said)) if _CERTAIN[best].get(word, _NONE) != _NONE})
     if sure or n_roads >= _FEWEST:
         return best, _WORDS[best]
-    return (best, _CERTAIN[best]) if _share(values, _CERTAIN[best]) > 0.5 else ("", {})
+    return (best, _CERTAIN[best]) if _share(said, _CERTAIN[best]) > 0.5 else ("", {})
 
 
-def _sample(values: AnyArray) -> list[Any]:
-    """Return filled values from all over a column."""
+def _said(values: AnyArray) -> list[list[str]]:
+    """Return the words of filled values from all over a column."""
     filled = [value for value in values if is_filled(value)]
-    return filled[:: max(len(filled) // _SAMPLE, 1)]
+    return [_split(value) for value in filled[:: max(len(filled) // _SAMPLE, 1)]]
 
 
-def _share(values: AnyArray, words: Mapping[str, str]) -> float:
-    """Return the share of the filled values that is known."""
-    if not words:
-        return 0.0
-    sample = _sample(values)
-    n_words = sum(any(_look_up(word, words) for word in _split(value)) for value in sample)
-    return n_words / len(sample) if sample else 0.0
+def _share(said: Sequence[Sequence[str]], words: Mapping[str, str]) -> float:
+    """Return the share of values, as lists of words, of which one is known."""
+    return sum(any(_look_up(word, words) for word in value) for value in said) / max(len(said), 1)
 
 
 def _kind_of(value: Any, words: Mapping[str, str]) -> str:

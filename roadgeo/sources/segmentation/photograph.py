@@ -35,6 +35,7 @@ _VOID_CORE_PX, _VOID_AREA_PX, _VOID_EDGE_PX = 15, 20_000, 9
 _DARKEST, _LIGHTEST = 8, 245  # of stretched values
 #: 8-bit values that span less, but for half a hundredth at either end, are stretched: night, haze, a flat scan.
 _FEW_VALUES = 64
+_COARSE = 64  # of a sample's pixels one is looked at first
 _SHOWN_SHARE = 0.1  # of a frame that lies within margins and is not filled, at least
 _FILL_PATCH_PX, _FILL_AREA_PX, _MANY_VALUES = 5, 400, 9
 #: A line of a margin has one value, but for paper's grain (share of the range of values in the middle of the frame)
@@ -222,10 +223,8 @@ def _find_tones(dataset: DatasetReader, bands: list[int], name: str) -> tuple[_T
     _report_margins(name, box, (width, height))
     exact, sample, valid = (values[rows, columns] for values in (exact, sample, valid))
     fills, shown = _find_fills(name, exact, valid)
-    observed = sample[shown].astype(np.float64)
-    low, high = np.percentile(observed, [1, 99])
-    is_8_bit = dataset.dtypes[bands[0] - 1] == "uint8"
-    keeps = is_8_bit and not 0 < np.ptp(np.percentile(observed, [0.5, 99.5])) < _FEW_VALUES
+    very_low, low, high, very_high = np.percentile(sample[shown].astype(np.float64), [0.5, 1, 99, 99.5])
+    keeps = dataset.dtypes[bands[0] - 1] == "uint8" and not 0 < very_high - very_low < _FEW_VALUES
     plain = [(fill, 255 if fill.min() > (_WHITE if keeps else high) else 0) for fill in fills]
     return _Tones(palette, None if keeps else (low, high), plain), box
 
@@ -245,11 +244,12 @@ def _within_margins(values: AnyArray, valid: BoolArray) -> tuple[slice, slice]:
 
 def _less_margin(values: AnyArray, valid: BoolArray, box: tuple[slice, slice], grain: float) -> tuple[slice, slice]:
     """Return a part of (H, W, B) values without the lines at its edges that are of one value each, where observed."""
-    part, shown = values[box].astype(np.float32), valid[box]
+    part, shown = values[box], valid[box]
     inner = []
     for axis, side in enumerate(box):
         lines, observed = (part, shown) if axis == 0 else (part.swapaxes(0, 1), shown.T)
-        off = np.abs(lines - np.median(lines, axis=1, keepdims=True)).max(axis=2)
+        middle = np.median(lines, axis=1, keepdims=True).astype(np.float32)
+        off = np.abs(lines.astype(np.float32) - middle).max(axis=2)
         n_plain, n_observed = ((off <= grain) & observed).sum(axis=1), observed.sum(axis=1)
         uneven = np.flatnonzero((n_plain < _PLAIN_SHARE * n_observed) | (n_observed < 0.5 * lines.shape[1]))
         first, last = (uneven[0], uneven[-1]) if len(uneven) else (0, len(lines) - 1)
@@ -271,14 +271,15 @@ def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> tuple[list[Any
     It may be the least, the greatest, or a corner's. Patches are large, but where the colour lies far from all others,
     or in several corners.
     """
-    seen, shown = values[valid], valid
+    seen, shown = np.ascontiguousarray(values[valid].T), valid
     fills: list[AnyArray] = []
     corners = values[[0, 0, -1, -1], [0, -1, 0, -1]]
-    for fill in np.unique([np.full_like(seen[0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
-        rest = seen[(seen != fill).any(axis=1)].astype(np.float64)
-        if len(np.unique(rest)) < _MANY_VALUES:
+    for fill in np.unique([np.full_like(seen[:, 0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
+        rest = seen[:, (seen != fill[:, None]).any(axis=0)]
+        if all(len(np.unique(rest[:, ::step])) < _MANY_VALUES for step in (_COARSE, 1)):  # all where a few do not tell
             continue
-        is_apart = max(rest.min() - float(fill.max()), float(fill.min()) - rest.max()) > np.ptp(rest)
+        least, greatest = float(rest.min()), float(rest.max())
+        is_apart = max(least - float(fill.max()), float(fill.min()) - greatest) > greatest - least
         is_sure = is_apart or np.count_nonzero((corners == fill).all(axis=1)) > 1
         is_fill = find_voids((values == fill).all(axis=2) & valid, least=_FILL_AREA_PX if is_sure else None)
         if is_fill.any() and (valid & ~is_fill).sum() >= _SHOWN_SHARE * valid.sum():
