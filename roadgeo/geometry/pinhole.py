@@ -128,12 +128,12 @@ def _camera_homography(
     tilt, azimuth = np.radians(tilt_deg), np.radians(tilt_azimuth_deg)
     axis = np.array([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), -np.cos(tilt)])
     level = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
-    steep = np.cross(axis, level)
+    steep = np.array([-axis[2] * level[1], axis[2] * level[0], axis[0] * level[1] - axis[1] * level[0]])
     right = np.cos(roll) * level + np.sin(roll) * steep
     down = np.cos(roll) * steep - np.sin(roll) * level
     # A pixel's ray is rays @ (column, row, 1).
     offset = axis * focal - right * size_px[0] / 2 - down * size_px[1] / 2
-    rays = np.column_stack([right, down, offset])
+    rays = np.array([right, down, offset]).T
     camera = -axis * focal * gsd_m
     ground = np.array([camera[2] * rays[0] - camera[0] * rays[2], camera[2] * rays[1] - camera[1] * rays[2], -rays[2]])
     ground /= focal * np.cos(tilt)

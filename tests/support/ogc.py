@@ -4,13 +4,20 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 VALIDATOR = "osgeo_utils.samples.validate_gpkg"
+PROGRAM = f"""
+import sys
+from {VALIDATOR} import main
+sys.exit(max(main([sys.argv[0], "-k", "--extra", "--warning-as-error", path]) for path in sys.argv[1:]))
+"""
 
 
+@cache
 def find_python() -> str:
     """A Python that has GDAL's: as a rule the system's."""
     for python in (sys.executable, "/usr/bin/python3"):
@@ -24,9 +31,9 @@ def find_python() -> str:
     pytest.skip("no Python has GDAL's validator of GeoPackages: install python3-gdal")
 
 
-def validate(path: Path) -> str:
-    """What is wrong with a GeoPackage, warnings included; "" where nothing is."""
-    command = [find_python(), "-m", VALIDATOR, "-k", "--extra", "--warning-as-error", str(path)]
+def validate(*paths: Path) -> str:
+    """What is wrong with GeoPackages, warnings included; "" where nothing is."""
+    command = [find_python(), "-c", PROGRAM, *map(str, paths)]
     done = subprocess.run(command, capture_output=True, text=True, env={"PATH": os.environ["PATH"]})
     output = "".join(f"{line}\n" for line in (done.stdout + done.stderr).splitlines())
     assert bool(done.returncode) == bool(output)
