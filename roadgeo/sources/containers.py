@@ -162,13 +162,10 @@ def _stream_gdal(
                 raise RoadSourceError(
                     f"{path}: is cut off: {skip + len(data.shapes):,} of {total:,} features are in it"
                 )
-            shapes, table = shapely.from_wkb(data.shapes, on_invalid="ignore"), dict(data.columns)
-            if column:
-                named = table[column.lower()] if column in columns else table.pop(column.lower())
-                rows = np.isin(named.astype(str), levels)
-                shapes, table = shapes[rows], {name: values[rows] for name, values in table.items()}
             meta |= ({"part": part} if part else {}) | ({"levels": hint} if hint and not levels else {})
-            yield RoadTable(shapes, data.crs, table, meta)
+            shapes = np.asarray(shapely.from_wkb(data.shapes, on_invalid="ignore"))
+            table = RoadTable(shapes, data.crs, dict(data.columns), meta)
+            yield _of_levels(path, table, levels) if column else table
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(parts))
 
 
