@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +16,7 @@ from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo._text import listed
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import are_labels, are_patches, are_roads
-from roadgeo.storage.rasters import open_raster, page_of, read_palette, sidecar_nodata, value_bands
+from roadgeo.storage.rasters import open_array, open_raster, page_of, read_palette, sidecar_nodata, value_bands
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -112,34 +112,12 @@ def open_bands(source: str | os.PathLike[str] | AnyArray, choice: Choice, name: 
         It cannot be read, holds no numbers, or lacks the band.
     """
     if not isinstance(source, str | os.PathLike):
-        yield _of_array(np.ma.asanyarray(source), choice, name or "array")
+        name = name or "array"
+        with open_array(np.ma.asanyarray(source), name, choice.names) as dataset:
+            yield replace(_of_dataset(dataset, choice, name, None, ""), option="")
         return
     with open_raster(source, name) as dataset:
         yield _of_dataset(dataset, choice, name or os.fspath(source), sidecar_nodata(source), page_of(source))
-
-
-def _of_array(array: AnyArray, choice: Choice, name: str) -> Bands:
-    """Wrap an (H, W) or (H, W, bands) array."""
-    if array.ndim not in (2, 3) or array.dtype.kind not in "biuf" or array.size == 0:
-        raise MaskError(
-            f"{name}: an array of shape {array.shape} and type {array.dtype}; expected (rows, columns) or "
-            "(rows, columns, bands) of numbers or booleans"
-        )
-    whole = array if array.ndim == 3 else array[..., None]
-    data = np.ma.getdata(whole)
-    valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
-    labels = _labels(choice.names if len(choice.names) == data.shape[2] else [""] * data.shape[2])
-    chosen, is_chosen = _choose(name, choice, labels)
-    data = data[..., chosen]
-    if data.dtype == np.bool_:
-        data = data.view(np.uint8)
-
-    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
-        rows = slice(top, bottom, step)
-        return data[rows, ::step], None if valid is None else valid[rows, ::step]
-
-    bands = tuple(labels[i] for i in chosen)
-    return Bands(name, (data.shape[0], data.shape[1]), read, bands, labels, is_chosen=is_chosen, option="")
 
 
 def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float | None, page: str) -> Bands:

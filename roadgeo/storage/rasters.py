@@ -16,7 +16,7 @@ import shutil
 import stat
 import struct
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
@@ -48,6 +48,7 @@ __all__ = [
     "count_frames",
     "is_raster",
     "name_page",
+    "open_array",
     "open_raster",
     "page_of",
     "pages_of",
@@ -152,7 +153,7 @@ def open_raster(
         if not page and drivers == ["GTiff"]:
             page = _PAGE.fullmatch(pages_of(path)[0].removeprefix("GTIFF_DIR:1:"))
     if drivers[0] in ("NumPy", "OpenCV"):
-        with warnings.catch_warnings(), _opened_array(path, name) as dataset:
+        with open_array(_read_array(path, name), name) as dataset:
             yield dataset
         return
     with warnings.catch_warnings():
@@ -524,44 +525,55 @@ def _keep_few_drivers() -> None:
 
 
 @contextmanager
-def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetReader]:
-    """Copy an array into memory as a raster: (H, W), or with bands first or last."""
+def open_array(array: AnyArray, name: str, labels: Sequence[str] = ()) -> Iterator[DatasetReader]:
+    """Copy an array into memory as a raster: (H, W), or with bands, which may have labels, first or last.
+
+    Raises
+    ------
+    MaskError
+        It has another shape, holds no numbers, or takes too much memory.
+    """
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
-    try:
-        with bounded(path, MaskError):
-            array = _bands_first(_read_array(path))
-    except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers") from error
-    if array is None or array.dtype.kind not in "biuf":
-        what = "" if array is None else f" of {array.dtype}"
-        raise MaskError(f"{name}: holds an array{what}; expected (rows, columns) of real numbers, bands first or last")
-    kind = "uint8" if array.dtype.kind == "b" else "float32" if array.dtype == np.float16 else array.dtype.name
-    kind = "float64" if array.dtype.kind == "f" and array.dtype.itemsize > 8 else kind
-    count, height, width = array.shape
-    warnings.simplefilter("ignore", NotGeoreferencedWarning)
-    with ExitStack() as stack:
-        with bounded(path, MaskError):
+    values, hidden = (_bands_first(part) for part in (np.ma.getdata(array), np.ma.getmaskarray(array)))
+    if values is None or values.dtype.kind not in "biuf":
+        raise MaskError(
+            f"{name}: an array of {array.dtype} of shape {array.shape}; expected (rows, columns) of real "
+            "numbers or booleans, with bands first or last"
+        )
+    kind = "uint8" if values.dtype.kind == "b" else "float32" if values.dtype == np.float16 else values.dtype.name
+    kind = "float64" if values.dtype.kind == "f" and values.dtype.itemsize > 8 else kind
+    count, height, width = values.shape
+    with ExitStack() as stack, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with bounded(name, MaskError):
             kept = rasterio.open("", "w+", driver="MEM", count=count, height=height, width=width, dtype=kind)
             raster = stack.enter_context(kept)
             for band in range(count):
-                raster.write(np.asarray(array[band], kind), band + 1)
+                raster.write(np.asarray(values[band], kind), band + 1)
+            if hidden is not None and hidden.any():
+                raster.write_mask(~hidden.any(axis=0))
+        if len(labels) == count:
+            raster.descriptions = labels
         raster.transform = rasterio.Affine.identity()
         yield raster
 
 
-def _read_array(path: str | os.PathLike[str]) -> AnyArray:
+def _read_array(path: str | os.PathLike[str], name: str) -> AnyArray:
     """Read the array of a file of NumPy's, or what GDAL does not read of the family of PNM."""
-    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
-        if file.read(1) != b"P":
-            return np.lib.format.open_memmap(path, mode="r")  # unpickles nothing
-        file.seek(0)
-        stored = np.frombuffer(file.read() + b"\n", np.uint8)  # OpenCV has the last number end
-    array = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
+    try:
+        with bounded(path, MaskError), open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+            if file.read(1) != b"P":
+                return np.lib.format.open_memmap(path, mode="r")  # unpickles nothing
+            file.seek(0)
+            stored = np.frombuffer(file.read() + b"\n", np.uint8)  # OpenCV has the last number end
+            array = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
+    except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers") from error
     if array is None:
-        raise ValueError("damaged or cut short")
+        raise MaskError(f"{name}: damaged or cut short; copy or export it again")
     return array if array.ndim == 2 else array[..., 2::-1]  # blue comes first
 
 
