@@ -107,7 +107,7 @@ class Rivals:
         self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
         self._compared: dict[tuple[Place, ...], Place] = {}  # by the place and those that were met
-        self._last: dict[Search[Place], tuple[int, Place | None]] = {}  # with how many places the part had then
+        self._pictured: dict[tuple[Place, ...], Place] = {}  # by the place by roads and those that were verified
 
     def __call__(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
         """Return the part whose likeliest place leads all others by twice the score needed, or None."""
@@ -146,19 +146,13 @@ class Rivals:
 
     def compare(self, part: Search[Place]) -> Place | None:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
-        verified = self.estimators[part].verified
-        if part not in self._last or self._last[part][0] < len(verified):
-            place = self._by_roads_and_picture(part)
-            self._last[part] = len(verified), place
-        return self._last[part][1]
-
-    def _by_roads_and_picture(self, part: Search[Place]) -> Place | None:
         by_roads, estimator = self._among_equals(part), self.estimators[part]
         is_drawn = estimator.scene.probability is None
         if by_roads is None or by_roads.score >= _CERTAIN or is_drawn or time.perf_counter() > self._deadline:
             return by_roads
         started = time.perf_counter()
-        by_picture = self._by_picture(estimator)
+        by_picture = self._pictured.get((by_roads, *estimator.verified)) or self._by_picture(estimator)
+        self._pictured[by_roads, *estimator.verified] = by_picture  # a rival may have been verified meanwhile
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, by_picture), key=lambda place: -place.score)
         is_same, lesser = best.same(other), max(other.score, 0.0)

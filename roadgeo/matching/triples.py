@@ -173,7 +173,7 @@ def propose(
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     weighed = np.arange(len(query)) if among is None else among
-    weighed = weighed[:: max(1, math.ceil(len(weighed) / _MAX_WEIGHED))]
+    weighed = np.ascontiguousarray(weighed[:: max(1, math.ceil(len(weighed) / _MAX_WEIGHED))])
     # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)

@@ -14,6 +14,7 @@ from worlds.scenes import PLANE, random_lines, random_network, scene_of
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.kernels.compilation import Kernel
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching import scene
 from roadgeo.matching.index import build_index
@@ -87,6 +88,13 @@ def test_the_time_limit_holds(request, place, name):
     assert time.process_time() - started < 4.0  # a round may be under way, and the machine busy
     assert location.status != "located"
     assert location.reason
+
+
+def test_many_intersections_leave_no_kernel_to_numba(lattice, monkeypatch):
+    """An array that is not contiguous is: it is compiled for seconds, in the middle of a search."""
+    monkeypatch.setattr(Kernel, "by_numba", property(lambda kernel: pytest.fail(kernel.name)))
+    mask = RoadMask(MASKS["4,900 crossings"]() > 0)
+    assert not locate(mask, lattice, LocateOptions(search=SearchOptions(time_limit_s=0.8))).located
 
 
 def test_the_limit_holds_for_all_references_together(lattice, town):
