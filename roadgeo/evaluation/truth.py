@@ -21,7 +21,6 @@ whose integers are pixel centres, and lists of north-up tiles with `easting`, `n
 from __future__ import annotations
 
 import csv
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -39,6 +38,7 @@ from roadgeo.geometry.projection import transform
 from roadgeo.outputs.names import table_text
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import FeatureTable, write_layers
+from roadgeo.storage.tables import read_rows, read_text
 
 __all__ = ["SCHEMA", "Truth", "read_truth", "truth_from_record", "truth_to_record", "write_truth"]
 
@@ -124,17 +124,11 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
         No such file, or not such a table.
     """
     source = Path(path)
-    try:
-        text = source.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else error
-        raise RoadSourceError(
-            f"cannot read {source}: {cause}; expected a table of truths, CSV or JSON, as `roadgeo simulate` writes it"
-        ) from error
+    text = read_text(source, "a table of truths, CSV or JSON, as `roadgeo simulate` writes it")
     try:
         if text.lstrip().startswith("{"):
             return [truth_from_record(record, crs) for record in json.loads(text)["queries"]]
-        rows = list(csv.DictReader(io.StringIO(text)))
+        rows = read_rows(text)
         columns = set(rows[0]) if rows else set()
         if "tile" in columns:
             return [_from_tile(row, crs) for row in rows]

@@ -6,12 +6,10 @@ A motion is a homography, pixel (column, row; GDAL's corner convention) of a fra
 from __future__ import annotations
 
 import csv
-import io
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -28,6 +26,7 @@ from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.index import bucket_roads, neighbour_grid
 from roadgeo.matching.scene import MIN_COS, Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
+from roadgeo.storage.tables import read_rows, read_text
 
 __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion"]
 
@@ -73,13 +72,9 @@ def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     RoadSourceError
         There is no such file, or it is no such table.
     """
+    text = read_text(path, "a CSV file of motions")
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else error
-        raise RoadSourceError(f"cannot read {path}: {cause}; expected a CSV file of motions") from error
-    try:
-        rows = list(csv.DictReader(io.StringIO(text)))
+        rows = read_rows(text)
         matrices = {row["frame"]: np.array([float(row[name]) for name in _COLUMNS]).reshape(3, 3) for row in rows}
     except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise RoadSourceError(

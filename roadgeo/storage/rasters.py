@@ -38,6 +38,7 @@ from roadgeo.storage.orientation import (
     tiff_values,
     turn_upright,
 )
+from roadgeo.storage.tables import decode
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -314,8 +315,7 @@ def read_beside(path: str | os.PathLike[str], beside: Path) -> str:
         It takes too much memory.
     """
     with bounded(path, MaskError):
-        stored = beside.read_bytes() if beside.is_file() else b""
-        return stored.decode("utf-16" if stored[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
+        return decode(beside.read_bytes(), "replace") if beside.is_file() else ""
 
 
 #: Suffixes of images, which no text has.
