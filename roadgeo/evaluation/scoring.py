@@ -17,7 +17,6 @@ import numpy as np
 from roadgeo.evaluation.truth import Truth
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.location import ERROR_RATES
 
 __all__ = [
     "BREAKDOWNS",
@@ -65,6 +64,8 @@ class Score:
         Errors of the corners TL, TR, BR, BL, and the standard deviations (of each coordinate) reported for them.
     log10_odds : float
         As reported; NaN where none are.
+    promise : (str, float, float) or None
+        `error_rate` as reported: the kind of query, the least score of its band, and the share that is wrong at most.
     seconds, reason
         As reported.
     """
@@ -78,6 +79,7 @@ class Score:
     corners_m: tuple[float, ...] = (math.nan,) * 4
     sigma_m: tuple[float, ...] = (math.nan,) * 4
     log10_odds: float = math.nan
+    promise: tuple[str, float, float] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     properties: dict[str, float] = field(default_factory=dict)
     reason: str = ""
@@ -107,6 +109,7 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
         unanswered,
         status=str(location["status"]),
         log10_odds=_number(location.get("log10_odds")),
+        promise=_promise(location.get("error_rate")),
         seconds={step: _number(value) for step, value in (location.get("seconds") or {}).items()},
         reason=str(location.get("reason") or ""),
     )
@@ -123,6 +126,10 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
         corners_m=tuple(errors[1:].tolist()),
         sigma_m=tuple(_number(value) for value in location.get("corner_sigma_m") or [None] * 4),
     )
+
+
+def _promise(rate: Mapping[str, Any] | None) -> tuple[str, float, float] | None:
+    return (str(rate["kind"]), float(rate["score"]), float(rate["at_most"])) if rate else None
 
 
 def _number(value: object) -> float:
@@ -233,8 +240,9 @@ def break_down(scores: Sequence[Score], by: str) -> list[Summary]:
 
 @dataclass(frozen=True)
 class Band:
-    """Wrong ones of the masks located with scores of a band, from `score` to the next, and the share stated at most."""
+    """Wrong ones of the queries of a kind located with scores from `score` to the next band; the share at most."""
 
+    kind: str
     score: float
     wrong: Share
     at_most: float
@@ -246,15 +254,10 @@ class Band:
 
 
 def calibrate_scores(scores: Sequence[Score]) -> list[Band]:
-    """Count the wrong ones in each band of `location.ERROR_RATES`; masks without a place are wrong when located."""
-    rates = ERROR_RATES["mask"]
-    reported = [s for s in scores if s.located and math.isfinite(s.log10_odds)]
-    band_of = np.digitize([s.log10_odds for s in reported], [rate.score for rate in rates]) - 1
-    bands = [[s for s, band in zip(reported, band_of, strict=True) if band == k] for k in range(len(rates))]
-    return [
-        Band(rate.score, share(sum(not s.right for s in band), len(band)), rate.at_most)
-        for rate, band in zip(rates, bands, strict=True)
-    ]
+    """Count the wrong ones of each `error_rate` that answers state; masks without a place are wrong when located."""
+    promised = [(s.promise, not s.right) for s in scores if s.located and s.promise is not None]
+    wrong = {promise: [is_wrong for its, is_wrong in promised if its == promise] for promise, _ in sorted(promised)}
+    return [Band(kind, score, share(sum(some), len(some)), most) for (kind, score, most), some in wrong.items()]
 
 
 @dataclass(frozen=True)

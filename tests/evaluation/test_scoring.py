@@ -36,6 +36,7 @@ def answer(east=0.0, **changes):
         "homography": shifted.tolist(),
         "corner_sigma_m": [1.0] * 4,
         "log10_odds": 7.5,
+        "error_rate": {"kind": "mask", "score": 5.0, "at_most": 0.154},
         "seconds": {"open": 1.0, "vectorize": 0.01, "match": 0.02, "refine": 0.03},
     } | changes
 
@@ -121,18 +122,24 @@ def test_breakdowns_put_each_query_into_one_class():
     assert [s.name for s in break_down(scores, "kind")] == ["k"]
 
 
-def located(n_wrong, log10_odds):
-    return [Score("", "k", True, "located", k >= n_wrong, log10_odds=log10_odds) for k in range(200)]
+def located(n_wrong, promise):
+    return [Score("", "k", True, "located", k >= n_wrong, promise=promise) for k in range(200)]
 
 
-def test_scores_that_promise_too_much_are_told():
-    for rate in ERROR_RATES["mask"]:
-        honest, boastful = (round(200 * share * rate.at_most) for share in (0.5, 2.0))
-        found = {band.score: band for band in calibrate_scores(located(honest, rate.score))}
-        assert (found[rate.score].wrong.hits, found[rate.score].wrong.of) == (honest, 200)
-        assert all(band.holds for band in found.values())
-        found = {band.score: band for band in calibrate_scores(located(boastful + 4, rate.score))}
-        assert [score for score, band in found.items() if not band.holds] == [rate.score]
+@pytest.mark.parametrize(("kind", "rate"), [(kind, rate) for kind, rates in ERROR_RATES.items() for rate in rates])
+def test_scores_that_promise_too_much_are_told(kind, rate):
+    promise = kind, rate.score, rate.at_most
+    honest, boastful = (min(round(200 * part * rate.at_most), 190) for part in (0.5, 2.0))
+    unpromised = [*located(200, None), *located(0, ("another kind", 0.0, 0.5))]
+    (other, band) = calibrate_scores([*unpromised, *located(honest, promise)])
+    assert ((band.kind, band.score), (band.wrong.hits, band.wrong.of)) == ((kind, rate.score), (honest, 200))
+    assert (other.wrong.hits, other.holds, band.holds) == (0, True, True)
+    assert [band.holds for band in calibrate_scores(located(boastful + 4, promise))] == [False]
+
+
+def test_a_promise_is_the_error_rate_that_an_answer_states():
+    assert score(TRUTH, answer()).promise == ("mask", 5.0, 0.154)
+    assert score(TRUTH, answer(error_rate=None)).promise is None
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
