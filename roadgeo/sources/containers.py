@@ -274,6 +274,7 @@ def _what_is_wrong(path: Path) -> str:
         has_open_text
         or (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
         or (ending in _BY_LINES and not last.endswith(b"}"))
+        or (ending == ".dxf" and not last.rstrip(b"\0").endswith(b"EOF"))
         or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
     )
     return f"is cut off after {size:,} bytes; copy or export it again" if is_cut else ""

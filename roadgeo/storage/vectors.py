@@ -147,7 +147,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
         raise RoadSourceError(f"{path}: names an unknown CRS: {reason}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
         reason = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
-        reason = reason.replace(str(file), str(path))
+        reason = re.sub(r"^\S+\.cpp, \d+: ", "", reason.replace(str(file), str(path)))
         hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if reason.startswith("of") else ""
         raise RoadSourceError(f"{path}: not readable as a map of roads: {reason}{hint}{remedy(reason)}") from error
 
