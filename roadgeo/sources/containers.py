@@ -53,8 +53,8 @@ _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d
 _LIMITED = re.compile(
     rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^<>]*\bnext\s*=\s*[\"']\w"
 )
-#: Formats of a feature a line; and the name of an XML file's outermost element, behind what may come before it.
-_BY_LINES = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl")
+#: Formats of JSON, which may have a feature a line; the name of an XML file's outermost element, behind its header.
+_JSON = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl", ".json", ".geojson", ".topojson")
 _ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*+(?:<[?!].*?>\s*+)*+<([\w:.-]+)"), 1 << 12
 #: What servers and checkouts put in a file's place.
 _IN_PLACE = re.compile(rb"(?i)\s*(?:(<!doctype html|<html\b)|version https://git-lfs)")
@@ -273,7 +273,7 @@ def _what_is_wrong(path: Path) -> str:
     is_cut = (
         has_open_text
         or (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
-        or (ending in _BY_LINES and not last.endswith(b"}"))
+        or (ending in _JSON and not last.endswith((b"}", b"]")))
         or (ending == ".dxf" and not last.rstrip(b"\0").endswith(b"EOF"))
         or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
     )

@@ -155,7 +155,7 @@ def test_a_json_that_is_something_else_is_passed_over(tmp_path, caplog):
     "name",
     [
         *("a.shp", "a.geojsonl", "a.ndjson", "a.geojson", "a.gpkg", "a.fgb", "a.gml", "a.kml", "a.parquet"),
-        *("a.osm.pbf", "a.csv", "a.dxf", "a.mif", "a.gpx"),
+        *("a.osm.pbf", "a.csv", "a.dxf", "a.mif", "a.gpx", "a.json"),
     ],
 )
 def test_a_file_that_is_cut_off_is_refused(tmp_path, name, share):
@@ -169,7 +169,7 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path, name, share):
         table = gpd.GeoDataFrame({"highway": highway}, geometry=lines, crs=4326)
         table = table[["geometry"]] if name in ("a.dxf", "a.gpx") else table
         drivers = {"ndjson": "GeoJSONSeq", "geojsonl": "GeoJSONSeq", "gml": "GML", "kml": "KML", "fgb": "FlatGeobuf"}
-        drivers |= {"dxf": "DXF", "mif": "MapInfo File", "gpx": "GPX"}
+        drivers |= {"dxf": "DXF", "mif": "MapInfo File", "gpx": "GPX", "json": "GeoJSONSeq"}
         table.to_file(path, engine="pyogrio", driver=drivers.get(path.suffix[1:]))
     assert len(read_lines(path).lines) > 3
     whole = path.read_bytes()
