@@ -460,7 +460,7 @@ def _of_values(columns: dict[str, AnyArray]) -> RoadTable:
     """Return a table of which a column, by its values, holds WKB or WKT."""
     taken = _take_shapes(columns)
     if taken is None:
-        raise ValueError("none of its columns holds shapes")
+        raise ValueError("it declares no geometry column, and none holds WKB or WKT")
     return RoadTable(taken[0], taken[1] or None, columns)
 
 

@@ -282,4 +282,4 @@ def reading(path: Path, unpacked: str | None = None) -> Iterator[None]:
     except (RoadgeoError, MemoryError, ImportError):
         raise
     except Exception as error:  # many libraries read such files, and a damaged one may make them raise anything
-        raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error
+        raise RoadSourceError(f"{path}: not readable as a map of roads: {first_line(error)}; is it damaged?") from error
