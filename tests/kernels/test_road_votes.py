@@ -1,6 +1,7 @@
 """Votes of one intersection and the roads around it, against slow twins."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -84,6 +85,7 @@ class TestFindTurns:
         assert len(turns_of([0.0, 1.0], packed([0.0, 2.0]))) == 0
 
 
+@cache  # rings drawn by plain Python take most of the time
 def world(seed, n_places=30):
     """A raster of random words, places on it, and points to test at three scales."""
     rng = np.random.default_rng(seed)
@@ -107,8 +109,8 @@ class TestVote:
     @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize(("middle", "max_off"), [(0.0, math.pi), (0.0, 0.8), (3.0, 0.8)])
     def test_like_the_twin(self, seed, middle, max_off):
-        n_places = 300 if max_off > 3 else 900
-        _, places, _, rays = world(seed, n_places)
+        _, places, _, rays = world(seed, 900)
+        asked = range(300 if max_off > 3 else 900)
         rng = np.random.default_rng(seed)
         scales, marked = np.array([1.0, 1.1, 1.2]), np.zeros((3, WORDS), np.uint64)
         n = 150
@@ -117,7 +119,7 @@ class TestVote:
         )
         marked[1] = 0  # nothing in reach
         expected, tried_all = [], 0
-        for j in range(n_places):
+        for j in asked:
             for turn in turns_of(rays, places[1:3], j):
                 if abs(math.remainder(turn - middle, 2 * math.pi)) <= max_off:
                     tried_all += 1
@@ -133,7 +135,7 @@ class TestVote:
         assert len(expected) > 6
         found = np.empty((len(expected) // 2 + 1, 4))  # more than are kept
         tolerance, toward, most = (int(whole([a])[0]) for a in (TOLERANCE, middle, max_off - 1e-9))
-        everywhere = np.arange(n_places)
+        everywhere = np.array(asked)
         with np.errstate(over="ignore"):  # bits are counted by a product of which the uppermost digits count
             kept, tried = vote(everywhere, whole(rays), tolerance, toward, most, scales, marked, 15, places, found)
         assert (kept, tried) == (len(found), tried_all)
