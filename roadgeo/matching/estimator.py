@@ -64,9 +64,9 @@ _LEAST_SHARE_BY_ROADS = 0.2
 _N_EQUALS, _OWN_TUPLES, _EQUAL = 12, TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
-#: by roads, and comparing a hypothesis with the map, plus the time for each road point.
+#: by roads, and fitting a hypothesis to the map once, plus the time for each road point.
 _ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _BY_ROADS_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 0.1e-3
-_VERIFIED_S, _VERIFIED_POINT_S = 1e-3, 3.5e-6
+_FITTED_S, _FITTED_POINT_S = 1e-3, 3.5e-6
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class TripleEstimator:
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
-        self._n_rounds, self._n_by_roads, self._anchors = 0, 0, set[int]()
+        self._n_rounds, self._n_by_roads, self._anchors, self._fitted_s = 0, 0, set[int](), 0.0
         sweeps.members.append(self)
         self.in_company = False  # whether it is searched with others first, by triples, and then alone
 
@@ -169,10 +169,9 @@ class TripleEstimator:
     @property
     def work(self) -> float:
         """Seconds that a usual machine takes for the work done (see `search.Estimator`), on one core."""
-        verified_s = _VERIFIED_S + _VERIFIED_POINT_S * len(self.scene.dense_points)
         tried_s = _ROUND_S * self._n_rounds + _TUPLE_S * self.n_candidates + _PLACE_S * self.n_screened
         by_roads_s = (_BY_ROADS_S - _GROWN_S) * self._n_by_roads
-        return tried_s + _GROWN_S * self.n_hypotheses + by_roads_s + verified_s * self.n_verified
+        return tried_s + _GROWN_S * self.n_hypotheses + by_roads_s + self._fitted_s
 
     @property
     def n_anchors(self) -> int:
@@ -392,6 +391,8 @@ class TripleEstimator:
         for _ in range(5):
             args = place.matrix, place.scene, place.index, place.matched
             refined = refine(*args, options, n_points, held=place.by_roads)
+            n_all = len(place.scene.dense_points)
+            self._fitted_s += _FITTED_S + _FITTED_POINT_S * min(n_points or n_all, n_all)
             fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or fault is not None or self._is_far(refined.matrix):
                 return (place, True) if best >= 0.0 else (place.but(fault=fault, score=-math.inf), False)
