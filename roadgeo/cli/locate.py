@@ -30,6 +30,7 @@ from roadgeo.cli.options import (
     hinted,
     make_cluster,
     make_options,
+    n_threads,
     open_maps,
     threaded,
 )
@@ -170,8 +171,9 @@ def locate_command(asked: Locate) -> int:
     cluster = make_cluster(asked.engine, asked.scheduler, asked.jobs, asked.divide_map)
     if asked.divide_map and (cluster is None or asked.how.method == "pair" or asked.explain):
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
-    # A mask alone gets threads; on a cluster each worker keeps to one.
-    options = replace(options, threads=asked.jobs if len(tasks) == 1 and cluster is None else 1)
+    # An image alone gets threads; on a cluster each worker keeps to one.
+    is_alone = len(tasks) == 1 and cluster is None
+    options = replace(options, threads=max(asked.jobs, n_threads(asked.jobs)) if is_alone else 1)
     make_folder(asked.out_dir)
     batch = replace(
         asked.batch,

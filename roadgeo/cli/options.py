@@ -440,8 +440,8 @@ class Shared:
         "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
         type=Plugin(offered, options={"overlay": "--plot", "report": "--report"}), multiple=True, default=())
     jobs: int = option("-j --jobs", "N", SEARCH,
-        "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
-        "Default: 1.", limits=(1, None), default=1, show_default=False)
+        "Processes that locate at the same time. For one image alone, threads: as many as processors if not given. "
+        "Results do not depend on it. Default: 1.", limits=(1, None), default=1, show_default=False)
     engine: Engine | None = option("--engine", None, SEARCH,
         "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers, which "
         "survives their death. Needs dask and distributed.", rare=True)
@@ -545,7 +545,7 @@ def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = No
 
 
 def n_threads(jobs: int = 1) -> int:
-    """Return how many threads a model gets."""
+    """Return how many threads a model, or the search for an image alone, gets."""
     return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
 
 

@@ -158,12 +158,8 @@ def _of_dataset(dataset: DatasetReader, choice: Choice, name: str, nodata: float
 
     has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     bands = tuple(labels[i] for i in picked) if palette is None else ("red", "green", "blue")
-    size, own, structure = (
-        (dataset.height, dataset.width),
-        _model_threshold(dataset),
-        dataset.tags(ns="IMAGE_STRUCTURE"),
-    )
-    is_lossy = "JPEG_QUALITY" in structure or structure.get("COMPRESSION_REVERSIBILITY") == "LOSSY"
+    size, own, kept = (dataset.height, dataset.width), _model_threshold(dataset), dataset.tags(ns="IMAGE_STRUCTURE")
+    is_lossy = "JPEG_QUALITY" in kept or kept.get("COMPRESSION_REVERSIBILITY") == "LOSSY"
     return Bands(name, size, read, bands, labels, has_alpha, is_chosen, page, own, is_lossy=is_lossy)
 
 

@@ -53,7 +53,8 @@ _MATCHED = re.compile(rb"\b(?:numberMatched|totalFeatures)\"?\s*[:=]\s*[\"']?(\d
 _LIMITED = re.compile(
     rb"\"(exceededTransferLimit)\"\s*:\s*true|\"rel\"\s*:\s*\"next\"|<[\w:]*FeatureCollection\b[^<>]*\bnext\s*=\s*[\"']\w"
 )
-#: Formats of JSON, which may have a feature a line; the name of an XML file's outermost element, behind its header.
+#: Formats of JSON, which may have a feature a line, and bytes before it; the name of an XML file's outermost element.
+_BEFORE_JSON = b"\xef\xbb\xbf\x1e \t\r\n"
 _JSON = (".geojsonl", ".geojsons", ".geojsonseq", ".ndjson", ".jsonl", ".json", ".geojson", ".topojson")
 _ROOT, _HEAD_BYTES = re.compile(rb"(?s)(?:\xef\xbb\xbf)?\s*+(?:<[?!].*?>\s*+)*+<([\w:.-]+)"), 1 << 12
 #: What servers and checkouts put in a file's place.
@@ -273,7 +274,7 @@ def _what_is_wrong(path: Path) -> str:
     is_cut = (
         has_open_text
         or (ending == ".shp" and len(head) >= 28 and 2 * int.from_bytes(head[24:28], "big") > size)
-        or (ending in _JSON and not last.endswith((b"}", b"]")))
+        or (ending in _JSON and head.lstrip(_BEFORE_JSON)[:1] in (b"{", b"[") and not last.endswith((b"}", b"]")))
         or (ending == ".dxf" and not last.rstrip(b"\0").endswith(b"EOF"))
         or (root is not None and not last.endswith((b"</" + root[1] + b">", b"-->", b"/>")))
     )
