@@ -37,10 +37,8 @@ def announce(algorithm: str, finding: Finding) -> None:
     if chosen:
         text = location["reason"]
     elif located:
-        up_deg = location["rotation_deg"] % 360.0
         rate = location["error_rate"]
-        text = f"located, {location['gsd_m']:.2g} m per pixel, up is {up_deg:.0f}° from north"
-        text += f"; {rate['said']}" if rate else ""
+        text = f"located, {location['gsd_m']:.2g} m per pixel" + (f"; {rate['said']}" if rate else "")
     else:
         near = finding.parameters.get("NEAR")
         text = f"{'not sure near the chosen place either: ' if near else ''}{location['reason']}"
