@@ -218,12 +218,9 @@ def _search_alone(
         list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
     searches = {Search(estimator): estimator for estimator in estimators}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
+    usual = replace(options.search, time_limit_s=time_limit_s)
     limits = {
-        search: replace(
-            options.search,
-            time_limit_s=time_limit_s,
-            work_limit_s=options.search.work_limit_s * n_units(len(estimator.index)),
-        )
+        search: replace(usual, work_limit_s=usual.work_limit_s * n_units(len(estimator.index)))
         for search, estimator in searches.items()
     }
     search_each(limits, rivals.stands, rivals.promise, _name_maps(searches, say))

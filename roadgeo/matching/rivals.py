@@ -134,7 +134,8 @@ class Rivals:
 
     def promise(self, part: Search[Place]) -> float:
         """Return what the likeliest place of a part explains, in scores needed."""
-        return max((place.log10_likelihood for place in self.estimators[part].verified), default=0.0) / self.needed
+        most = max((place.log10_likelihood for place in self.estimators[part].verified), default=0.0)
+        return most / max(self.needed, 1.0)  # of a user who asks for less
 
     def _rivals(self, part: Search[Place], best: Place) -> bool:
         """Return whether another part has another place that explains nearly as much as the best place of all."""

@@ -62,16 +62,16 @@ class SearchOptions:
 
 
 class _Budget:
-    """The rest of a search's work and time."""
+    """The work and time of a search, and their limits."""
 
     def __init__(self, options: SearchOptions) -> None:
-        self.left_s = options.work_limit_s
+        self.work_s, self.limit_s = 0.0, options.work_limit_s
         self.deadline = time.perf_counter() + options.time_limit_s
 
     @property
     def spent(self) -> str:
         """Return which limit is reached: "work", "time", or "" for neither."""
-        if self.left_s <= 0.0:
+        if self.work_s >= self.limit_s:
             return "work"
         return "time" if time.perf_counter() > self.deadline else ""
 
@@ -90,8 +90,8 @@ class Search(Generic[Model]):
     stopped : str
         Why it ended: "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
         ended the search.
-    seconds, work_s : float
-        Time, and work, spent on this part.
+    seconds : float
+        Time spent on this part.
     """
 
     def __init__(self, estimator: Estimator[Model]) -> None:
@@ -101,7 +101,7 @@ class Search(Generic[Model]):
         self.stage = 0
         self.ended = False
         self.stopped = ""
-        self.seconds = self.work_s = 0.0
+        self.seconds = 0.0
         self._charged_s = estimator.work
         self._stages = estimator.stages()
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
@@ -130,10 +130,9 @@ class Search(Generic[Model]):
                 break
 
     def _charge(self, budget: _Budget) -> None:
-        """Subtract the work done since the last call from the work left."""
+        """Charge a budget for the work done since the last call."""
         work = self.estimator.work
-        budget.left_s -= work - self._charged_s
-        self.work_s += work - self._charged_s
+        budget.work_s += work - self._charged_s
         self._charged_s = work
 
 
@@ -148,11 +147,7 @@ def search_together(
     before an answer is accepted. `proves` returns the part whose answer stands out from all others, or None. It is
     called when an answer reaches `SearchOptions.accept`, which is enough without it, and at the end of each stage.
     """
-    _end(parts, _search_together(parts, options or SearchOptions(), proves))
-
-
-def _end(parts: Sequence[Search[Model]], ended_by: str) -> None:
-    """Tell each part why it ended."""
+    ended_by = _search_together(parts, options or SearchOptions(), proves)
     for part in parts:
         if ended_by in ("work", "time") and not part.ended:
             part.stopped = ended_by
@@ -214,7 +209,8 @@ def search_each(
             part.stopped = "accepted"
         if part.stopped in ("accepted", "time"):
             break
-        done[part] = (math.log10(part.work_s) if part.work_s else -math.inf) - promise(part)
+        work_s = budgets[part].work_s
+        done[part] = (math.log10(work_s) if work_s else -math.inf) - promise(part)
     for part in left:
         part.stopped = part.stopped or ("time" if budgets[part].spent == "time" else "elsewhere")
 
