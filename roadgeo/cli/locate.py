@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from roadgeo._options import IMAGE, RESULTS, SEARCH, option, part, take
 from roadgeo._progress import say_nothing
@@ -173,7 +174,8 @@ def locate_command(asked: Locate) -> int:
         raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
     # An image alone gets threads; on a cluster each worker keeps to one.
     is_alone = len(tasks) == 1 and cluster is None
-    options = replace(options, threads=max(asked.jobs, n_threads(asked.jobs)) if is_alone else 1)
+    is_asked = click.get_current_context().get_parameter_source("jobs") is not ParameterSource.DEFAULT
+    options = replace(options, threads=(asked.jobs if is_asked else n_threads()) if is_alone else 1)
     make_folder(asked.out_dir)
     batch = replace(
         asked.batch,

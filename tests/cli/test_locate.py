@@ -1,5 +1,6 @@
 """The command line on real roads: the demonstration's map and masks."""
 
+import importlib
 import json
 import os
 import re
@@ -419,3 +420,17 @@ def test_the_json_says_how_it_was_made(porto: Path, capfd: pytest.CaptureFixture
     assert found["reference_digest"] == reference_digest(porto)
     assert 0 < found["rmse_m"] < 3
     assert found["rmse_px"] == pytest.approx(found["rmse_m"] / found["gsd_m"], rel=0.5)
+
+
+@pytest.mark.parametrize(("jobs", "threads"), [([], 3), (["--jobs", "1"], 1), (["--jobs", "2"], 2)])
+def test_an_image_alone_gets_the_processors_unless_jobs_are_given(
+    jobs: list[str], threads: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    locate, asked = importlib.import_module("roadgeo.cli.locate"), list[int]()
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    monkeypatch.setattr(locate, "open_maps", lambda *_: [])
+    monkeypatch.setattr(locate, "locate_masks", lambda *given, **_: asked.append(given[3].search.threads) or iter(()))
+    mask = tmp_path / "mask.png"
+    mask.write_bytes(b"")
+    main(["locate", str(mask), "--reference", "none", "--out-dir", str(tmp_path), *jobs])
+    assert asked == [threads]
