@@ -131,5 +131,5 @@ def _search(
     if len(references) > 1:
         say(f"searching {len(references)} maps together")
     searched = search_references(query, parts, options, left, explained, say=say)
-    spent_s = sum(one.match_s + one.refine_s for one in searched)
+    spent_s = sum(one.seconds.total for one in searched)
     return query, contest(query, searched, parts, options, max(left - spent_s, 0.0)), options

@@ -119,7 +119,7 @@ class TripleEstimator:
         this one.
         """
         self.near = near
-        self.ledger = ledger or Ledger()
+        self.ledger = ledger or Ledger(len(index))
         self.events = events or Events()
         self.refine_s = 0.0
         self.n_nulls = 0
@@ -178,10 +178,10 @@ class TripleEstimator:
         """Intersections of the query that were looked up."""
         return len(self._anchors)
 
-    def _count(self, n_places: int) -> None:
-        """Count further places as tried."""
+    def _count(self, n_places: int, by: str) -> None:
+        """Count further places as tried, which triples or roads proposed."""
         self.n_screened += n_places
-        self.ledger.n_tried += n_places
+        self.ledger.tried[by] += n_places
 
     def _rounds_of_roads(self) -> Iterator[list[Place]]:
         """Yield places that grew by roads from an anchor, on all units, and were not met before."""
@@ -189,7 +189,7 @@ class TripleEstimator:
         for rounds in self._votes_of_roads():
             fresh: list[Place] = []
             for anchor, n_tried, n_proposed, grown in rounds:
-                self._count(n_tried)
+                self._count(n_tried, "roads")
                 self.n_hypotheses += n_proposed
                 self._n_by_roads += n_proposed
                 self._look_for(anchor)
@@ -232,9 +232,9 @@ class TripleEstimator:
 
     def enough(self) -> bool:
         """Return whether the limit of screened places, for a map as large as all parts together, is reached."""
-        n = max(self.ledger.n_reference, len(self.index))
+        n = self.ledger.n_reference
         larger_by = n_units(n) if self.sweeps.alone else larger(n)
-        return self.ledger.n_by_triples >= int(self.options.max_places * larger_by)
+        return self.ledger.tried["triples"] >= int(self.options.max_places * larger_by)
 
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
@@ -242,8 +242,7 @@ class TripleEstimator:
         self.n_tuples += proposals.n_tuples
         self.n_candidates += proposals.n_hits
         looked_at = np.flatnonzero(allowed)[:most]
-        self._count(len(looked_at))
-        self.ledger.n_by_triples += len(looked_at)
+        self._count(len(looked_at), "triples")
         kept = screen_proposals(self.scene, self.index, proposals, looked_at)
         self.events.note("screened", proposals, allowed, kept)
         return kept
@@ -354,7 +353,7 @@ class TripleEstimator:
     def _scored(self, place: Place) -> Place:
         """Return a place with its lead over the other places met, less the log10 number of places tried."""
         most = max(self._nearby.get(place, 0.0), self._most_elsewhere(place), 0.0)
-        scored = place.but(score=place.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1)))
+        scored = place.but(score=place.log10_likelihood - most - math.log10(max(self.ledger.tried.total(), 1)))
         if place in self._nearby:
             self._nearby[scored] = self._nearby[place]
         return scored

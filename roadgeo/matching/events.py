@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,8 +38,15 @@ class Events:
 
 @dataclass
 class Ledger:
-    """Places tried in one search, on all of its parts together: each of them could have agreed by chance."""
+    """Places tried in one search, on all of its parts together: each of them could have agreed by chance.
 
-    n_reference: int = 0  # intersections of all parts: attempts are bounded as on one map of that size
-    n_tried: int = 0
-    n_by_triples: int = 0  # places that triples proposed
+    Attributes
+    ----------
+    n_reference : int
+        Intersections of all parts: attempts are bounded as on one map of that size.
+    tried : Counter
+        The places, by what proposed them: "triples" or "roads".
+    """
+
+    n_reference: int
+    tried: Counter[str] = field(default_factory=Counter)

@@ -30,13 +30,13 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.scene import MIN_COS, Scene, in_pixels
 from roadgeo.matching.shifts import shifted
 
 __all__ = ["Agreement", "Evidence", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
-_SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
+_SIGMAS = np.geomspace(0.25, 1.6, 5)
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
 #: Range of residuals, in usual deviations; number of bins; number of bins of roads that agree.
 _REACH, _BINS, _AGREEING = 4.0, 24, 18
@@ -47,11 +47,10 @@ _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
 _BLUR_CELLS = 0.35
 #: Usual distance between a mapped road and the true road, and usual error of a traced road.
 MAP_SIGMA_M, PIXEL_SIGMA_PX = 1.8, 1.0
-#: This length of road, query and map together, counts as one independent statement, but never less than this number of
-#: pixels.
-STATEMENT_M, STATEMENT_PX = 480.0, 96.0
-#: Width of the frame's pieces by which two places are compared: the larger of these two.
-_PIECE_M, _PIECE_PX = 60.0, 12.0
+#: This length of road, query and map together, counts as one independent statement.
+STATEMENT_M = 480.0
+#: Width of the frame's pieces by which two places are compared.
+_PIECE_M = 60.0
 #: Most regions along the frame's longer side in which a place may be contradicted; their least width; and the factor by
 #: which pixels are coarser than in the middle of the frame where ground is too far away to count.
 _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
@@ -98,7 +97,7 @@ class Evidence:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
         self._sigma_m = math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
         self.statement_px = statement_px(gsd_m)
-        self._piece_px = max(_PIECE_M / gsd_m, _PIECE_PX)
+        self._piece_px = in_pixels(_PIECE_M, gsd_m)
         width, height = scene.size
         self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
         self._observed_px = float(scene.observed.sum()) * scene.field_scale**2
@@ -298,7 +297,7 @@ def statement_px(gsd_m: float) -> float:
     Likelihoods times this number compare places of different scale, for both then count the same pixels. Without it a
     place with larger pixels has more statements.
     """
-    return max(STATEMENT_M / gsd_m, STATEMENT_PX)
+    return in_pixels(STATEMENT_M, gsd_m)
 
 
 def tolerance_m(gsd_m: float) -> float:

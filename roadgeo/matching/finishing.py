@@ -48,7 +48,7 @@ _CENTER_SIGMA_PX = 0.5
 _GAP, _PIECE = 1.5, 12
 #: Beyond three standard deviations no road is met: there the influence, 3 / (1 + 3^2), drops to zero. Roads at nearly
 #: that distance account for this drop, spread over half a standard deviation: it lowers the slope of the influence.
-_NEAR_END, _FALL = 2.5, 0.3 / 0.5
+_NEAR_END, _FALL = 2.5, 0.6
 #: Where the slopes leave a fit undetermined, as for a bent mask, all roads hold it with this part of their weights.
 _LEAST_SLOPE = 0.17
 

@@ -11,7 +11,7 @@ from roadgeo._arrays import BoolArray, FloatArray
 from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.structs import Held
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.refinement import NO_PAIRS, Equations, Refined, RefineOptions
+from roadgeo.matching.refinement import Equations, Refined, RefineOptions
 from roadgeo.matching.scene import Scene
 from roadgeo.roads.intersections import Intersections
 
@@ -107,7 +107,8 @@ def fit_lens(
             return None
         equations.p[:] = np.append((homography / homography[2, 2]).ravel()[:8], start)
     held = Held(points, places, 0.5 * equations.weight * len(core) / len(some))
-    fitted = equations.adjust(NO_PAIRS, held)
+    none = equations.pairs(points[:0], places[:0], 0.0)
+    fitted = equations.adjust(none, held)
     return None if fitted is None or fitted.share < max(_HOPELESS, FEWEST / len(equations.samples.xy)) else fitted
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -14,7 +15,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.geometry.projection import from_lonlat
-from roadgeo.location import Stats
+from roadgeo.location import Seconds, Stats
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Events, Ledger
 from roadgeo.matching.finishing import measure_corners, measured
@@ -56,9 +57,11 @@ class Searched:
         As in `Search`; "" if no map was searched.
     said : str
         The method's own sentence on the result.
-    n_searched, n_tried, n_anchors : int
-        Intersections of the part of the reference that was searched, places screened, and intersections of the query
-        that were looked up.
+    counts : Counter
+        Intersections of the part of the reference that was "searched", places "tried", and "anchors": intersections of
+        the query that were looked up.
+    seconds : Seconds
+        Time spent on matching and refining.
     likeliest : tuple of Place
         The likeliest places that were verified, by traced roads alone.
     better : Place or None
@@ -71,12 +74,9 @@ class Searched:
     places: tuple[Place, ...] = ()
     stopped: str = ""
     said: str = ""
-    n_searched: int = 0
-    n_tried: int = 0
-    n_anchors: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
     stats: Stats = field(default_factory=Stats)
-    match_s: float = 0.0
-    refine_s: float = 0.0
+    seconds: Seconds = field(default_factory=Seconds)
     events: Events = field(default_factory=Events)
     likeliest: tuple[Place, ...] = ()
     better: Place | None = None
@@ -88,6 +88,10 @@ class Searched:
         """The places that the answer rests on: the likeliest and its rival, as far as they exist."""
         best = self.places[:1]
         return (*best, *(place.rival for place in best if place.rival is not None))
+
+    def later(self, spent_s: float) -> Searched:
+        """Return the result after a search before it that took some seconds."""
+        return replace(self, seconds=replace(self.seconds, match=self.seconds.match + spent_s))
 
     def less_likely(self, log10: float) -> Searched:
         """Return the result with all places less likely by a number: they could have agreed by chance more often."""
@@ -130,7 +134,7 @@ def search_references(
         spent_s = time.perf_counter() - started
         left_s = time_limit_s - spent_s
         begun, *others = _search(query, coarse + fine, options, left_s, explained, ahead, proposed, say)
-        return [replace(begun, match_s=begun.match_s + spent_s), *others]
+        return [begun.later(spent_s), *others]
 
 
 def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], list[Part]]:
@@ -169,22 +173,22 @@ def _search(
         return [Searched(index, events=Events(explained)) for index in indexes]
     if options.method == "pair":
         return _search_pairs_in_turn(query, indexes, options, time_limit_s)
-    started, ledger = time.perf_counter(), Ledger()
+    started = time.perf_counter()
     sweeps = SharedSweeps(query.scene, options.match.camera, ahead)
-    begun = [_begin(sweeps, index, options, Events(explained), ledger) for index in indexes]
+    begun = [_begin(sweeps, index, options, Events(explained)) for index in indexes]
     for result in begun:
         if result.estimator is not None and proposed:
             here = (matrix for index, matrix in proposed if index is result.index)
             result.estimator.proposed = [Place(query.scene, result.estimator.index, matrix) for matrix in here]
     together = [result.estimator for result in begun if result.estimator is not None]
     units = sum(n_units(len(estimator.index)) for estimator in together)
+    ledger = Ledger(sum(len(estimator.index) for estimator in together))
     for estimator in together:
-        estimator.in_company = units > 1
+        estimator.in_company, estimator.ledger = units > 1, ledger
     estimators = {Search(estimator): estimator for estimator in together}
-    ledger.n_reference = sum(result.n_searched for result in begun if result.estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
-    scale = larger(sum(result.n_searched for result in begun))
+    scale = larger(ledger.n_reference)
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, rivals)
@@ -255,9 +259,7 @@ def may_show(part: Part, options: LocateOptions, frame_m: float) -> bool:
     return (near is None or part.may_hold(near, frame_m)) and (within is None or part.touches(within))
 
 
-def _begin(
-    sweeps: SharedSweeps, index: ReferenceIndex, options: LocateOptions, events: Events, ledger: Ledger
-) -> Searched:
+def _begin(sweeps: SharedSweeps, index: ReferenceIndex, options: LocateOptions, events: Events) -> Searched:
     """Return a result without places; it has an estimator, unless the reference has no intersection near the hint."""
     part, near, within = index, _near(index, options.near), options.match.within
     if within is not None and not Whole(index).touches(within):
@@ -267,8 +269,8 @@ def _begin(
         part = _part(index, near[:2], reach)
         if len(part) == 0:
             return Searched(index, events=events)
-    estimator = TripleEstimator(sweeps, part, _of_effort(options), near, events, ledger)
-    return Searched(index, n_searched=len(part), events=events, estimator=estimator)
+    estimator = TripleEstimator(sweeps, part, _of_effort(options), near, events)
+    return Searched(index, counts=Counter(searched=len(part)), events=events, estimator=estimator)
 
 
 def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], rivals: Rivals, scale: float) -> Searched:
@@ -282,11 +284,9 @@ def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], riv
         places=() if best is None or best.refined is None else _listed(estimator, best, rivals.needed),
         likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]),
         stopped=search.stopped,
-        n_tried=estimator.n_screened,
-        n_anchors=estimator.n_anchors,
+        counts=begun.counts + Counter(tried=estimator.n_screened, anchors=estimator.n_anchors),
         stats=Stats(*counts, work_ms),
-        match_s=search.seconds - estimator.refine_s,
-        refine_s=estimator.refine_s,
+        seconds=Seconds(match=search.seconds - estimator.refine_s, refine=estimator.refine_s),
         estimator=estimator if kept else None,
         search=search if kept else None,
     )
@@ -362,7 +362,7 @@ def _search_pairs_in_turn(
     for n_left in range(len(indexes), 0, -1):
         share = replace(pair, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
         result = _search_pairs(query, indexes[-n_left], share)
-        work_s, time_s = max(work_s - result.stats.work_ms / 1000, 0.0), max(time_s - result.match_s, 0.0)
+        work_s, time_s = max(work_s - result.stats.work_ms / 1000, 0.0), max(time_s - result.seconds.total, 0.0)
         searched.append(result)
     return searched
 
@@ -376,9 +376,9 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions) -> 
         index,
         stopped=match.stopped,
         said=match.reason,
-        n_searched=len(index),
+        counts=Counter(searched=len(index)),
         stats=Stats(match.n_samples, match.candidates, match.hypotheses, match.hypotheses, round(1000 * match.work_s)),
-        match_s=match.seconds,
+        seconds=Seconds(match=match.seconds),
     )
     if match.homography is None:
         return searched

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -39,9 +39,10 @@ from roadgeo.matching.pairs import (
     type_keys,
 )
 from roadgeo.matching.refinement import denormalise, normalise
+from roadgeo.matching.search import SearchOptions
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["PAPER", "PairMatch", "PairOptions", "match_pairs", "read_options"]
+__all__ = ["PAPER", "PairMatch", "PairOptions", "match_pairs", "read_options", "thresholds"]
 
 #: Most intersections of a query that form tuples, chosen at random; all intersections still judge hypotheses.
 _MAX_TUPLE_INTERSECTIONS = 1000
@@ -96,8 +97,8 @@ class PairOptions(TupleOptions):
     one_to_one: bool = True
     rarest_first: bool = True
     refined: bool = True
-    work_limit_s: float = 10.0
-    time_limit_s: float = 60.0
+    work_limit_s: float = SearchOptions.work_limit_s
+    time_limit_s: float = SearchOptions.time_limit_s
 
     @property
     def tuples(self) -> TupleOptions:
@@ -108,27 +109,13 @@ class PairOptions(TupleOptions):
 #: The paper to the letter; what it leaves open stays as it is.
 PAPER = PairOptions(from_center=True, orders="all", one_to_one=False, refined=False)
 
-_SHARE = (1e-6, 1.0 - 1e-6)
-_YES_NO = {"yes": True, "no": False}
-#: Least and most of each number; the texts that others may be.
-_ALLOWED: dict[str, Any] = {
-    "d_max_m": (1.0, 1e5),
-    "delta_angle_deg": (0.0, 45.0),
-    "n_px": (6, 200),
-    "fit_error_px": (0.0, 10.0),
-    "from_center": _YES_NO,
-    "delta": _SHARE,
-    "delta_inlier": _SHARE,
-    "inlier_distance_m": (0.1, 1000.0),
-    "min_intersections": (2, 5000),
-    "lambda": _SHARE,
-    "lambda_1": _SHARE,
-    "p_query": _SHARE,
-    "orders": {"++": "++", "all": "all"},
-    "one_to_one": _YES_NO,
-    "rarest_first": _YES_NO,
-    "refined": _YES_NO,
-}
+#: Greatest factor between a number that is given and its usual value.
+_WIDEST = 20
+
+
+def thresholds() -> dict[str, Field[Any]]:
+    """Return the paper's thresholds by the names that they are given by."""
+    return {option.name.rstrip("_"): option for option in fields(PairOptions) if not option.name.endswith("_limit_s")}
 
 
 def read_options(given: Sequence[str], options: PairOptions) -> PairOptions:
@@ -139,24 +126,26 @@ def read_options(given: Sequence[str], options: PairOptions) -> PairOptions:
     ValueError
         There is no such option, or no such value.
     """
+    known = thresholds()
     for setting in given:
         name, _, value = setting.partition("=")
-        if name not in _ALLOWED:
-            raise ValueError(f"{setting!r}, expected NAME=VALUE, NAME one of {', '.join(_ALLOWED)}")
-        own = "lambda_" if name == "lambda" else name
-        options = replace(options, **{own: _read(setting, value, _ALLOWED[name])})
+        if name not in known:
+            raise ValueError(f"{setting!r}, expected NAME=VALUE, NAME one of {', '.join(known)}")
+        options = replace(options, **{known[name].name: _read(setting, value, known[name].default)})
     return options
 
 
-def _read(setting: str, value: str, allowed: Any) -> Any:
-    """Return the value of a setting: one of several texts, or a number within bounds of its type."""
-    if isinstance(allowed, dict):
-        if value not in allowed:
-            raise ValueError(f"{setting!r}, expected {' or '.join(allowed)}")
-        return allowed[value]
-    low, high = allowed
+def _read(setting: str, value: str, usual: Any) -> Any:
+    """Return the value of a setting: one of several texts, or a number like its `usual` value."""
+    if isinstance(usual, (bool, str)):
+        texts = {"yes": True, "no": False} if isinstance(usual, bool) else {"++": "++", "all": "all"}
+        if value not in texts:
+            raise ValueError(f"{setting!r}, expected {' or '.join(texts)}")
+        return texts[value]
+    low = usual / _WIDEST
+    high = 1.0 - low if usual < 1.0 else usual * _WIDEST  # what is usually below 1 stays below
     try:
-        number = type(low)(value)
+        number = type(usual)(value)
     except ValueError:
         number = math.nan
     if not low <= number <= high:

@@ -29,7 +29,7 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place, Weight
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import Scene, in_pixels
 from roadgeo.matching.shifts import Shift, move_about, shifted
 
 __all__ = ["Picture", "by_picture"]
@@ -46,10 +46,9 @@ _FINE, _SUREST = 16.0, 5.5
 _USUAL_M = 300.0
 #: Width of the map's roads, as they are drawn, metres.
 _ROAD_M = 8.0
-#: This length of the map's roads counts as one independent statement, metres, but never fewer than a fifth as many
-#: pixels. Without a place, the lead of the best place over the next falls off like an exponential: with this length a
-#: lead of 1 is met one time in ten.
-_STATEMENT_M, _STATEMENT_PX = 250.0, 0.2
+#: This length of the map's roads counts as one independent statement, metres. Without a place, the lead of the best
+#: place over the next falls off like an exponential: with this length a lead of 1 is met one time in ten.
+_STATEMENT_M = 250.0
 #: A greater log10 likelihood counts as this one (see `Picture.lead`).
 _MOST_LIKELIHOOD = 10.0
 #: Most cells along a side of the ground on which all shifts of a place are compared.
@@ -81,7 +80,7 @@ class Picture:
 
     def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
-        self.statement_px = _STATEMENT_M * max(1.0 / gsd_m, _STATEMENT_PX)
+        self.statement_px = in_pixels(_STATEMENT_M, gsd_m)
 
     def weigh(self, matrix: FloatArray, ground: Ground | None = None) -> float:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""

@@ -42,7 +42,7 @@ class Place:
     matrix : (3, 3) float64
         Query plane to reference plane.
     support : float
-        How well it is supported by what it grew from; compares within one kind of proposal.
+        How well it is supported by what it grew from; compares within one kind of proposal. NaN: it did not grow.
     by_roads : bool
         It did not grow from intersection to intersection, but by roads over the whole frame.
     grown : (N,) int or None
@@ -62,7 +62,7 @@ class Place:
     scene: Scene
     index: ReferenceIndex
     matrix: FloatArray
-    support: float = 1.0
+    support: float = math.nan
     by_roads: bool = True
     grown: IntArray | None = None
     refined: Refined | None = None

@@ -20,7 +20,6 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = [
-    "NO_PAIRS",
     "Equations",
     "RefineOptions",
     "Refined",
@@ -59,8 +58,6 @@ _N_ITERATIONS, _TOLERANCE_M = 15, 0.02
 _SIGMA_FLOOR = (0.1, 0.15)
 #: Prior standard deviation of k1.
 _K1_SIGMA = 0.1
-#: No matched intersections.
-NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), 0.0)
 
 
 @dataclass(frozen=True)
@@ -104,9 +101,9 @@ class Refined:
     matrix: FloatArray
     rms_m: float
     corner_covariance_m2: FloatArray
-    lens_k1: float = 0.0
-    k1_sigma: float = 0.0
-    share: float = 0.0
+    lens_k1: float
+    k1_sigma: float
+    share: float
 
     @property
     def corner_sigma_m(self) -> FloatArray:

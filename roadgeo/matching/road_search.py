@@ -31,14 +31,13 @@ from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import denormalise
-from roadgeo.matching.scene import AGREE_DEG, MIN_COS, Scene
+from roadgeo.matching.scene import AGREE_DEG, LARGE_PIXEL_M, MIN_COS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import farthest_first, larger
 from roadgeo.roads.intersections import unpack_branches
 
 __all__ = [
     "COARSE_PIXEL_M",
-    "LARGE_PIXEL_M",
     "PERSPECTIVE_SIGMA",
     "RADIUS_M",
     "RING_STEP",
@@ -360,9 +359,6 @@ _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
 #: width on the ground lies in this range, metres.
 _TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
-#: Larger pixels, metres, hardly show the surroundings of an intersection: the search around a hint `near` goes no
-#: further than frames of such pixels reach.
-LARGE_PIXEL_M = 5.0
 
 
 def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0) -> tuple[float, float]:
@@ -375,7 +371,7 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
     if coarseness != 1.0:
         low = max(low, coarseness * COARSE_PIXEL_M)
     high = max(high, low)
-    if road_width_px < _TELLING_WIDTH_PX:
+    if not road_width_px >= _TELLING_WIDTH_PX:  # NaN: not known
         return low, high
     least, most = (width / road_width_px for width in _ROAD_WIDTH_M)
     return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
@@ -398,12 +394,12 @@ class Turnout:
     n_map: int
     n_tried: int = 0
     last: int | None = None
-    _asked: int = field(default=0, init=False)
+    _asked: set[int] = field(default_factory=set, init=False)
 
     def includes(self, n: int) -> bool:
         """Return whether the n-th intersection (from 0) votes; the first part to reach it decides for all."""
-        if self.last is None and n >= self._asked:
-            self._asked = n + 1
+        if self.last is None and n not in self._asked:
+            self._asked.add(n)
             if n >= _LEAST_ANCHORS and self.n_tried >= _MAX_TRIED * larger(self.n_map):
                 self.last = n
         return self.last is None or n < self.last

@@ -24,9 +24,11 @@ from roadgeo.roads.vectorization import vectorize
 
 __all__ = [
     "AGREE_DEG",
+    "LARGE_PIXEL_M",
     "MIN_COS",
     "Query",
     "Scene",
+    "in_pixels",
     "prepare_scene",
     "query_neighbours",
     "read_query",
@@ -47,6 +49,14 @@ _FIELD_CELLS = 400
 #: the image's up by as much.
 AGREE_DEG = 25.0
 MIN_COS = math.cos(math.radians(AGREE_DEG))
+#: Larger pixels, metres, hardly show the surroundings of an intersection: the search around a hint `near` goes no
+#: further than frames of such pixels reach, and a length on the ground is never fewer pixels than of these.
+LARGE_PIXEL_M = 5.0
+
+
+def in_pixels(metres: float, gsd_m: float) -> float:
+    """Return a length on the ground in pixels of `gsd_m` metres, or of `LARGE_PIXEL_M` where these are larger."""
+    return metres / min(gsd_m, LARGE_PIXEL_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +90,7 @@ class Scene:
     probability : (h, w) float32 or None
         Mean probability of road of each cell, where the mask was made of such probabilities.
     road_width_px : float
-        Usual width of the mask's roads; 0: not known.
+        Usual width of the mask's roads; NaN: not known.
     """
 
     size: tuple[int, int]
@@ -98,7 +108,7 @@ class Scene:
     field_scale: float
     observed: BoolArray
     probability: Float32Array | None = None
-    road_width_px: float = 0.0
+    road_width_px: float = math.nan
 
     @cached_property
     def center(self) -> FloatArray:

@@ -17,7 +17,7 @@ from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.methods import Searched
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
-from roadgeo.matching.road_search import LARGE_PIXEL_M
+from roadgeo.matching.scene import LARGE_PIXEL_M
 
 __all__ = ["TruthStory", "finite_or_none", "tell_truth", "true_place"]
 

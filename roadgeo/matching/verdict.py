@@ -103,8 +103,8 @@ def _describe_work(query: Query, searched: Sequence[Searched], options: LocateOp
         sum(own.verified for own in stats),
         sum(own.work_ms for own in stats),
     )
-    match_s, refine_s = sum(result.match_s for result in searched), sum(result.refine_s for result in searched)
-    seconds = replace(query.seconds, match=match_s, refine=refine_s)
+    spent = [result.seconds for result in searched]
+    seconds = replace(query.seconds, match=sum(own.match for own in spent), refine=sum(own.refine for own in spent))
     soft: Kind = "mask" if query.scene.probability is None else "soft mask"
     kind: Kind = soft if without_hints(options) is None else "hints"
     content = Content(query.scene.size, query.graph, query.scene.intersections.xy, kind=kind)
@@ -228,7 +228,7 @@ def _refuse(
 ) -> Location:
     """Describe why nothing is reported, for the reference that came nearest."""
     nearest = next((result for result in searched if listed and listed[0].index.is_of_map(result.index)), None)
-    nearest = nearest or max(searched, key=lambda result: result.n_tried)
+    nearest = nearest or max(searched, key=lambda result: result.counts["tried"])
     names = list(dict.fromkeys(result.index.name for result in searched))  # shards bear the name of their map
     where = "on this map" if len(names) == 1 else "on these maps"
     code, reason = _why_nothing(query, nearest, listed, options, where)
@@ -287,9 +287,9 @@ def _why_nothing(
     if nearest.said:
         return Reason.TIME_LIMIT if nearest.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, nearest.said
     within = searched_within(options)
-    if nearest.n_searched == 0 and (options.near is not None or options.match.within is not None):
+    if nearest.counts["searched"] == 0 and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
-        return Reason.FEW_NEAR, f"the map has {counted(nearest.n_searched, 'intersection')} {given}{within}"
+        return Reason.FEW_NEAR, f"the map has {counted(nearest.counts['searched'], 'intersection')} {given}{within}"
     score = listed[0].score if listed else -math.inf
     best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if nearest.stopped == "work":
@@ -340,7 +340,7 @@ def _lead(score: float, needed: float) -> str:
 
 def _how_far(query: Query, searched: Searched, options: LocateOptions) -> str:
     """Describe the progress of a search that was cut short, and hints that would shorten it."""
-    far = f"{searched.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
+    far = f"{searched.counts['anchors']} of {len(query.scene.intersections)} intersections had been looked for"
     (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
     if (low, high) == usual:
         share = 2.0 * math.log(1.3) / math.log(high / low)

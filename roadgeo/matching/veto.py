@@ -54,7 +54,7 @@ def contest(
     """
     free, needed = without_hints(options), options.min_log10_odds
     leading = max(hinted, key=lambda result: result.places[0].score if result.places else -math.inf)
-    if free is None or leading.n_searched == 0 or options.method == "pair":
+    if free is None or leading.counts["searched"] == 0 or options.method == "pair":
         return list(hinted)
     is_reported = bool(leading.places) and leading.places[0].score >= needed
     if not is_reported:
@@ -69,11 +69,8 @@ def contest(
     better = _better(leading.places[0] if leading.places else None, others)
     if better is not None and not broken_hints(better, options):  # hints led past it
         return results
-    spent_s = sum(result.match_s + result.refine_s for result in results)
-    return [
-        replace(result, better=better, match_s=result.match_s + spent_s) if result is leading else result
-        for result in hinted
-    ]
+    spent_s = sum(result.seconds.total for result in results)
+    return [replace(result, better=better).later(spent_s) if result is leading else result for result in hinted]
 
 
 def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:

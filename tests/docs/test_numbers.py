@@ -259,6 +259,6 @@ def test_pages_state_the_numbers_of_the_code():
 
 def test_the_page_of_the_paper_names_every_option_and_those_of_the_paper():
     text = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
-    assert [name for name in paper._ALLOWED if f"`{name}" not in text] == []
+    assert [name for name in paper.thresholds() if f"`{name}" not in text] == []
     marked = re.findall(r"\*\(p\)\* `(\w+=\w+)`", text)
     assert paper.read_options(marked, PAIR) == PAPER

@@ -104,8 +104,8 @@ def test_places_on_many_maps_are_bounded_as_on_one(town):
     ledger = Ledger(n_reference=3 * len(town[1]))
     parts = [estimator_of(stranger, town[1], options, ledger=ledger) for _ in range(3)]
     search_together([Search(part) for part in parts], SearchOptions(time_limit_s=60.0))
-    assert ledger.n_tried == ledger.n_by_triples == sum(part.n_screened for part in parts)
-    assert 40 <= ledger.n_tried < 40 + max(part.n_screened for part in parts)
+    assert ledger.tried.total() == ledger.tried["triples"] == sum(part.n_screened for part in parts)
+    assert 40 <= ledger.tried.total() < 40 + max(part.n_screened for part in parts)
 
 
 def test_more_anchors_are_tried_on_a_small_map(town, scene):

@@ -22,7 +22,7 @@ from roadgeo.matching.refinement import Refined, RefineOptions, refine
 def test_only_places_that_may_be_reported_are_fitted_to_the_whole_frame(town, score, agreeing, within, mended):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     matrix, nothing = np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]]) @ truth, np.full(len(scene.intersections), -1)
-    rough, weight = Refined(matrix, 1.0, np.eye(8)), Weight(20.0, 480.0)
+    rough, weight = Refined(matrix, 1.0, np.eye(8), 0.0, 0.0, 1.0), Weight(20.0, 480.0)
     compared = Place(scene, town[1], matrix, grown=nothing, refined=rough, score=score, by=weight)
     vars(compared)["agreement"] = Agreement(agreeing, 0.8)
     best = measure_corners(estimator_of(scene, town[1], MatchOptions(within=within)), compared)

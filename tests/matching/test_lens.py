@@ -115,7 +115,9 @@ def test_a_wrong_place_does_not_grow(town):
 
 def honest(matrix, scene, index):
     """The deviations of the corners that are claimed for a homography."""
-    return with_honest_corners(Refined(matrix, 1.0, np.eye(8)), scene, index, RefineOptions()).corner_sigma_m
+    return with_honest_corners(
+        Refined(matrix, 1.0, np.eye(8), 0.0, 0.0, 1.0), scene, index, RefineOptions()
+    ).corner_sigma_m
 
 
 def test_corners_that_a_tilted_frame_shows_far_away_are_less_sure(town):
@@ -141,7 +143,7 @@ def test_where_a_mask_is_bent_corners_are_about_as_sure_as_claimed(town):
 def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town, monkeypatch):
     truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     scene = through_lens(straight, -0.12)
-    claimed = Refined(truth, 1.0, np.eye(8), -0.12)
+    claimed = Refined(truth, 1.0, np.eye(8), -0.12, 0.0, 1.0)
     corners = []
     for sigma in (0.0, 2.0):
         monkeypatch.setattr(finishing, "_CENTER_SIGMA_PX", sigma)

@@ -213,7 +213,7 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
     monkeypatch.setattr(rivals, "similar_places", None)
     wrong = move_about(Homography(truth)(evidence.scene.center), Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
     item, estimator = search_of(plain, wrong)
-    asked = Rivals({item: estimator}, Ledger(), NEEDED)
+    asked = Rivals({item: estimator}, Ledger(1), NEEDED)
     place = asked.compare(item)
     assert place is None or place.score < NEEDED
     assert asked([item]) is None
@@ -229,7 +229,7 @@ def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
 
 def test_where_nothing_was_met_nothing_is_compared(plain):
     item, estimator = search_of(plain)
-    asked = Rivals({item: estimator}, Ledger(), NEEDED)
+    asked = Rivals({item: estimator}, Ledger(1), NEEDED)
     assert asked.compare(item) is None
     assert asked([item]) is None
 
@@ -320,7 +320,7 @@ def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_r
     here, there = (Place(soft, index, matrix) for matrix in (truth, truth if is_same else elsewhere))
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
-    assert Rivals({item: estimator}, Ledger(), NEEDED).compare(item).score == pytest.approx(lead)
+    assert Rivals({item: estimator}, Ledger(1), NEEDED).compare(item).score == pytest.approx(lead)
 
 
 @pytest.mark.parametrize(("by", "n_compared"), [(-1.0, 1), (1.0, 1), (4.0, 2)])
@@ -337,5 +337,5 @@ def test_the_picture_takes_a_rival_that_leads_by_what_is_needed(plain, monkeypat
         return here.but(rival=there if len(compared) == 1 else None)
 
     monkeypatch.setattr(Rivals, "_compare_by_picture", compare)
-    Rivals({Search(estimator): estimator}, Ledger(), NEEDED)._by_picture(estimator)
+    Rivals({Search(estimator): estimator}, Ledger(1), NEEDED)._by_picture(estimator)
     assert len(compared) == n_compared

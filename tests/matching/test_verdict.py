@@ -18,7 +18,7 @@ def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Pl
     network, index = town
     truth, scene = sight_of(network, 5, tilt=tilt, sight=Sight(0.6))
     bent = truth + shaken_m * 1e-5 * np.array([[1.0, -2.0, 0.0], [1.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    place = Place(scene, index, bent, refined=Refined(bent, 1.0, sigma_m**2 * np.eye(8)), score=20.0)
+    place = Place(scene, index, bent, refined=Refined(bent, 1.0, sigma_m**2 * np.eye(8), 0.0, 0.0, 1.0), score=20.0)
     vars(place)["agreement"] = Agreement(0.9, 0.9)
     corners = np.c_[scene.corners, np.ones(4)] @ truth.T
     return georeference(place), index.plane.to_crs(corners[:, :2] / corners[:, 2:])

@@ -1,6 +1,7 @@
 """Hints that leave no rival prove nothing: a told place stands only if no other place explains more."""
 
 import re
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -45,7 +46,7 @@ def hinted(town, east_m=0.0, radius_m=60.0, **camera):
 def answer(town, options, places):
     """What is decided where hints lead to these places."""
     query, index = town
-    searched = [Searched(index, tuple(places), n_searched=len(index))]
+    searched = [Searched(index, tuple(places), counts=Counter(searched=len(index)))]
     return decide(query, veto.contest(query, searched, [Whole(index)], options, 60.0), options)
 
 
@@ -164,6 +165,6 @@ def test_no_map_is_opened_for_it_that_the_hints_exclude(town):
             raise AssertionError("it was opened")
 
     options = hinted(town)
-    searched = [Searched(index, found(town, options), n_searched=len(index))]
+    searched = [Searched(index, found(town, options), counts=Counter(searched=len(index)))]
     parts = [Whole(index), Far(index)]
     assert decide(query, veto.contest(query, searched, parts, options, 60.0), options).located

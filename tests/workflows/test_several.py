@@ -1,5 +1,6 @@
 """Places found on one or more references are judged once, together."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +34,7 @@ def town():
 
 def at(query, index, matrix, score, likelihood, covariance=None, agreeing=0.8):
     """A place as a search returns it."""
-    refined = Refined(matrix, 1.0, np.eye(8) / 2.0 if covariance is None else covariance)
+    refined = Refined(matrix, 1.0, np.eye(8) / 2.0 if covariance is None else covariance, 0.0, 0.0, 1.0)
     place = Place(query.scene, index, matrix, refined=refined, score=score, by=Weight(likelihood, 1.0))
     vars(place).update(agreement=Agreement(0.9, 0.9), agreeing=agreeing)
     return place
@@ -54,8 +55,8 @@ def searched(query, town):
         if best:
             explained = best[0].score if likelihood is None else likelihood
             best[0] = best[0].but(by=Weight(explained, 1.0), rival=best[1] if len(best) > 1 else None)
-        reported = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **reported}
-        return Searched(index, tuple(best[:1]), n_tried=tried, n_searched=len(index), **reported)
+        reported = {"stopped": "exhausted", "seconds": Seconds(match=1.0, refine=0.5), **reported}
+        return Searched(index, tuple(best[:1]), counts=Counter(tried=tried, searched=len(index)), **reported)
 
     return found
 
@@ -166,7 +167,7 @@ def test_a_refusal_lists_the_places_of_all_maps_by_their_scores(query, searched)
 def test_a_given_focal_length_is_used_for_the_tilt(query, town):
     """A homography alone tells the tilt to a degree at best, with the focal length it tells it to hundredths."""
     truth = camera((1000.0, 1000.0), SIZE, 1.0, tilt_deg=24.0, azimuth_deg=70.0, focal_px=900.0)
-    found = Searched(town, (at(query, town, truth, 20.0, 40.0),), "accepted", n_tried=1)
+    found = Searched(town, (at(query, town, truth, 20.0, 40.0),), "accepted", counts=Counter(tried=1))
     match = LocateOptions().match
     known = replace(match, camera=CameraOptions(focal_px=900.0))
     seen = judge(query, found, match=known)
