@@ -27,8 +27,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # The same examples in every run: what a random one finds once is no reason for another change to fail.
-settings.register_profile("steady", derandomize=True, deadline=None)
-settings.register_profile("brief", settings.get_profile("steady"), max_examples=30)
+settings.register_profile("steady", derandomize=True, deadline=None, max_examples=30)
 settings.load_profile("steady")
 
 
@@ -80,8 +79,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 def pytest_configure(config: pytest.Config) -> None:
     if names_files(config) and leaves_out(config):
         config.option.markexpr = ""  # and whole
-    if leaves_out(config):
-        settings.load_profile("brief")
     if config.getoption("measure") and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Measure())
 

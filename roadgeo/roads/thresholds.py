@@ -119,8 +119,8 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     if sample.observed.dtype.kind in "iu" and high <= _MAX_CLASS and not _is_dark_photograph(sample, levels):
         _refuse_classes(sample, levels)
         _LOG.warning(
-            "%s: values to %g are read as a faint soft map; numbers of roads, blurred by JPEG, would look so, too: "
-            "save them without loss",
+            "%s: values to %g are read as a faint soft map; numbers of roads, blurred by compression, would look so, "
+            "too: save them without loss",
             *(sample.name, high),
         )
         return _spread(values, _otsu(values))

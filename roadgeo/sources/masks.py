@@ -213,7 +213,7 @@ def _interpret(raster: Bands, choice: Choice, threshold: float | None, voids: bo
     thresholds = find_thresholds(sample) if threshold is None else (threshold,)
     if len(thresholds) > 1 and raster.is_lossy:
         _LOG.warning(
-            "%s: is read as a soft map, road above %g; numbers of roads, blurred by JPEG, would look so, too: "
+            "%s: is read as a soft map, road above %g; numbers of roads, blurred by compression, would look so, too: "
             "save them without loss, or give --threshold",
             *(raster.name, thresholds[0]),
         )

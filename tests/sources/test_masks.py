@@ -853,7 +853,7 @@ def test_numbers_that_loss_makes_a_soft_map_of_are_told_or_refused(
         except MaskError as error:
             assert "holds the classes" in str(error)  # noqa: PT017 - either of the two
         else:
-            assert re.search("numbers of roads, blurred by JPEG|a number for each of its roads", caplog.text)
+            assert re.search("numbers of roads, blurred by compression|a number for each of its roads", caplog.text)
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
