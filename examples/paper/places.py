@@ -54,6 +54,8 @@ def _draw_ground(ax: Any, index: Any, matrix: np.ndarray, pixels: Any) -> None:
     columns, rows = np.ceil((high - low) / _PIXEL_M).astype(int).tolist()
     canvas = cv2.warpPerspective(pixels, shift(-0.5, -0.5) @ to_canvas @ matrix @ shift(0.5, 0.5), (columns, rows))
     ax.imshow(canvas, extent=(low[0], high[0], low[1], high[1]))
-    x1, y1, x2, y2 = index.segments_within(low, high).T
-    ax.plot([x1, x2], [y1, y2], color="yellow", lw=0.8)
+    from matplotlib.collections import LineCollection
+
+    roads = np.reshape(index.segments_within(low, high), (-1, 2, 2))
+    ax.add_collection(LineCollection(roads, colors="yellow", linewidths=0.8))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))

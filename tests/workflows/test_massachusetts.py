@@ -17,21 +17,18 @@ from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import locate
 
-VIEWS = 2  # of each mask that lies on the map; of the others one
-
 
 @pytest.fixture(scope="module")
 def boston(data_dir) -> Reference:
     return roadgeo.index(gpd.read_file(data_dir / "boston" / "boston_osm_roads.gpkg"), "boston")
 
 
-def views(truth: Truth, mask: np.ndarray, count: int):
-    """The mask as it is, and so many times tilted by up to 30 degrees, turned, its missing corners black."""
+def views(truth: Truth, mask: np.ndarray):
+    """The mask as it is, and tilted by up to 30 degrees, turned, its missing corners black."""
     yield mask, truth.homography
     rng = np.random.default_rng(int(truth.file.split("/")[-1].removesuffix(".png")))
-    for _ in range(count):
-        warped, matrix = warp_mask(mask, rng.uniform(0, 30), rng.uniform(0, 360), rng.uniform(0, 360))
-        yield warped, truth.homography @ matrix
+    warped, matrix = warp_mask(mask, rng.uniform(0, 30), rng.uniform(0, 360), rng.uniform(0, 360))
+    yield warped, truth.homography @ matrix
 
 
 def center_error(found: np.ndarray, true: np.ndarray, size: tuple[int, int], to_found: pyproj.Transformer) -> float:
@@ -44,9 +41,11 @@ def test_masks_are_located_where_they_lie_and_nowhere_else(data_dir, boston):
     folder = data_dir / "massachusetts"
     to_found = pyproj.Transformer.from_crs("EPSG:26986", boston.index.plane.crs, always_xy=True)
     errors, refused, astray, n_present = [], [], [], 0
-    for truth in read_truth(folder / "tiles.csv"):
+    for number, truth in enumerate(read_truth(folder / "tiles.csv")):
         mask = np.where(cv2.imread(str(folder / truth.file), cv2.IMREAD_GRAYSCALE) > 127, 255, 0).astype(np.uint8)
-        for k, (view, homography) in enumerate(views(truth, mask, VIEWS if truth.on_map else 1)):
+        for k, (view, homography) in enumerate(views(truth, mask)):
+            if not truth.on_map and k != number % 2:  # one of the two
+                continue
             name = f"{truth.file}, view {k}"
             location = locate(read_mask(view, name=name), boston)
             n_present += truth.on_map
