@@ -23,11 +23,11 @@ _SCRIPT = Path(__file__).parent / "support" / "endurance.py"
 
 def test_neither_memory_nor_files_nor_time_grow() -> None:
     # In a process of its own: in this one other tests' files may be closed, and their connections open, meanwhile.
-    run = subprocess.run([sys.executable, str(_SCRIPT), "--count", "150"], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, str(_SCRIPT), "--count", "80"], capture_output=True, text=True, check=True)
     output = json.loads(run.stdout)
     assert set(output["became"]) == {"located", "not_located", "damaged"}
     assert output["open_files"][-1] == output["open_files"][1]
-    assert output["resident_mb"][-1] <= 1.05 * output["resident_mb"][1]
+    assert output["resident_mb"][-1] <= 1.02 * output["resident_mb"][1]
     assert min(output["median_ms"][-5:]) <= 1.5 * max(output["median_ms"][:5])
 
 
