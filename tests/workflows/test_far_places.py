@@ -16,6 +16,7 @@ from support.ogc import validate
 from worlds.fenway import write_vector
 
 from roadgeo.cli import main
+from roadgeo.evaluation import simulation
 
 
 def made_up_town(lon: float, lat: float, n: int = 15, spacing: float = 110.0) -> list[shapely.LineString]:
@@ -59,6 +60,7 @@ def test_from_road_lines_to_every_output(
 ) -> None:
     towns, crs, geometry_type = PLACES[name]
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(simulation, "MAX_TRIES", 400)  # not 4,000: between towns far apart it is in vain in any case
     roads = write_vector(tmp_path / "roads.gpkg", [line for town in towns for line in made_up_town(*town)])
     assert main(["index", "--roads", str(roads), "-o", "map.gpkg", "-q"]) == 0
     assert main(["reference", "check", "map.gpkg"]) == 0
