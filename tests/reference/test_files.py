@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference.test_network_file import editing
-from worlds.networks import grid_network
+from worlds.networks import IndexParts, grid_network, parts, two_networks
 
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.reference import plain_values
@@ -32,13 +32,6 @@ from roadgeo.reference.index_file import FORMAT_VERSION, read_manifest
 from roadgeo.reference.inspection import check_reference, describe_reference
 from roadgeo.reference.network_file import network_digest, read_network, write_network
 from roadgeo.roads.network import RoadNetwork, as_stored
-
-IndexParts = tuple[dict[str, Any], dict[str, np.ndarray]]
-
-
-def parts(network: RoadNetwork) -> IndexParts:
-    """Stand in for an index."""
-    return {"name": network.meta["name"], "n": len(network.intersections)}, {"xy": network.intersections.xy}
 
 
 def never(network: RoadNetwork) -> IndexParts:
@@ -258,18 +251,14 @@ def test_readers_keep_the_reference_they_opened(path: Path, network: RoadNetwork
 WRITER = """
 import sys
 from pathlib import Path
-from reference.test_files import parts, two_networks
 from roadgeo.reference.files import write_reference
+from worlds.networks import parts, two_networks
 networks = two_networks()
 while True:
     for network in networks:
         write_reference(Path(sys.argv[1]), network, parts(network))
         print("written", flush=True)
 """
-
-
-def two_networks() -> list[RoadNetwork]:
-    return [as_stored(grid_network(size, size, seed=size)) for size in (6, 16)]
 
 
 @contextmanager

@@ -7,9 +7,11 @@ import numpy as np
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
-from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.network import RoadNetwork, as_stored
 
-__all__ = ["grid_network", "same_values"]
+__all__ = ["IndexParts", "grid_network", "parts", "same_values", "two_networks"]
+
+IndexParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 def grid_network(columns: int = 5, rows: int = 4, seed: int = 0, **meta: Any) -> RoadNetwork:
@@ -51,3 +53,12 @@ def same_values(a: Any, b: Any) -> bool:
     """Whether two values of arrays hold the same bits, shapes and types."""
     pairs = [(getattr(a, field), getattr(b, field)) for field in a.__dataclass_fields__]
     return all(x.dtype == y.dtype and np.array_equal(x, y, equal_nan=True) for x, y in pairs)
+
+
+def parts(network: RoadNetwork) -> IndexParts:
+    """Stand in for an index."""
+    return {"name": network.meta["name"], "n": len(network.intersections)}, {"xy": network.intersections.xy}
+
+
+def two_networks() -> list[RoadNetwork]:
+    return [as_stored(grid_network(size, size, seed=size)) for size in (6, 16)]
