@@ -17,7 +17,7 @@ from worlds.demo import DRONE
 from worlds.hostile import MAPS, MASKS, mrf, naming, virtual
 
 from roadgeo import plugins
-from roadgeo.cli import cli
+from roadgeo.cli import cli, main
 from roadgeo.cli.fencing import fence_of
 from roadgeo.storage.fence import abi_version
 from roadgeo.storage.folders import cache_dir
@@ -218,12 +218,12 @@ def test_a_reference_in_another_folder_gets_its_index_there(porto: Path, tmp_pat
 
 def test_images_are_corrected_where_they_lie(porto: Path, tmp_path: Path) -> None:
     shutil.copy(DRONE, tmp_path)
-    assert roadgeo(tmp_path, "locate", "drone.png", "-r", str(porto)).returncode == 0
+    assert main(["locate", "drone.png", "-r", str(porto), "-q"]) == 0
     with rasterio.open(tmp_path / "drone_footprint.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as raster:
         raster.transform = rasterio.Affine.translation(30.0, 20.0) @ raster.transform
     done = roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "--in-place", "-o", "said")
     assert done.returncode == 4, done.stderr
-    assert roadgeo(tmp_path, "verify", "drone_footprint.tif", "-r", str(porto), "-o", "said").returncode == 0
+    assert main(["verify", "drone_footprint.tif", "-r", str(porto), "-o", "said", "-q"]) == 0
 
 
 def test_a_photographs_mask_of_an_earlier_run_may_be_looked_at(tmp_path: Path) -> None:

@@ -392,7 +392,7 @@ def test_the_style_of_a_mask_does_not_colour_the_photograph(porto: Path) -> None
 
 def test_what_is_missing_of_an_earlier_result_is_made_anew(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     shutil.copy(MASKS["drone"].path, "a.png")
-    locate = ["locate", "a.png", "-r", str(porto), "--plot", "--skip-existing"]
+    locate = ["locate", "a.png", "-r", str(porto), "--effort", "quick", "--plot", "--skip-existing"]
     assert main(locate[:-1]) == 0
     capfd.readouterr()
     for lost in ("a_overlay.png", "a_location.gpkg"):
