@@ -227,10 +227,7 @@ def locate_all(folder: Path, city: str, record: Path) -> None:
     import roadgeo
 
     cv2.setNumThreads(1)
-    done = read_answers(record)
-    masks = [name for name in json.loads((folder / f"{city}.masks").read_text(encoding="utf-8")) if name not in done]
-    if not masks:
-        return
+    masks = _unanswered(folder, city, record)
     reference = roadgeo.index(folder / f"{city}.parquet")
     roadgeo.locate(folder / f"{masks[0]}.png", reference)  # loading counts for no mask
     with record.open("a", encoding="utf-8") as file:
@@ -245,6 +242,12 @@ def locate_all(folder: Path, city: str, record: Path) -> None:
             answer["cpu_s"] = time.process_time() - started
             file.write(json.dumps({"mask": name, "answer": answer}) + "\n")
             file.flush()
+
+
+def _unanswered(folder: Path, city: str, record: Path) -> list[str]:
+    """List the masks of a city that `record` holds no answer to."""
+    done = read_answers(record)
+    return [name for name in json.loads((folder / f"{city}.masks").read_text(encoding="utf-8")) if name not in done]
 
 
 def read_answers(record: Path) -> dict[str, Any]:
@@ -288,6 +291,8 @@ def locate_in_processes(
 
     def run(city: str, place: Path, name: str) -> None:
         record = folder / f"answers_{name}_{city}.jsonl"
+        if not _unanswered(folder, city, record):
+            return
         command = [sys.executable, str(HERE / "examples" / "bench.py"), "--worker", city, str(record)]
         environment = os.environ | {"PYTHONPATH": str(place)}
         subprocess.run([*command, "--out", str(folder)], env=environment, check=True, cwd=folder)
