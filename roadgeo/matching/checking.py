@@ -27,7 +27,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Whole
 from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import fitted
-from roadgeo.matching.scene import Query
+from roadgeo.matching.scene import N_ROUGHLY, Query
 from roadgeo.matching.shifts import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.verdict import away, decide
 from roadgeo.matching.veto import contest
@@ -47,8 +47,6 @@ _MIN_ROADS_M = 300.0
 _SCALED, _TILTED_DEG = 1.1, 5.0
 #: Least standard deviation of a corner, metres: corners of a similarity depend on each other.
 _LEAST_SIGMA_M = 0.01
-#: Road points by which the places around are fitted roughly.
-_N_POINTS = 200
 
 
 @dataclass(frozen=True)
@@ -142,10 +140,10 @@ def _as_hints(given: Place, options: CheckOptions) -> LocateOptions:
 
 def _around(given: Place, options: CheckOptions) -> Iterator[Place]:
     """Yield the given place and those around it where the query's roads lie on roads, fitted roughly."""
-    yield fitted(given, LocateOptions().match, _N_POINTS)
+    yield fitted(given, LocateOptions().match, N_ROUGHLY)
     for shift in search_nearby(given.matrix, given.scene, given.index, options.search):
         start = replace(given, matrix=move_about(given.center, shift) @ given.matrix)
-        yield fitted(start, LocateOptions().match, _N_POINTS)
+        yield fitted(start, LocateOptions().match, N_ROUGHLY)
 
 
 def _judge(location: Location, given: Place, options: CheckOptions) -> Checked:

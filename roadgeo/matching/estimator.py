@@ -31,7 +31,7 @@ from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scen
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
-from roadgeo.matching.scene import AGREE_DEG
+from roadgeo.matching.scene import AGREE_DEG, NOTICEABLE
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
     WITHOUT_ROADS,
@@ -46,11 +46,9 @@ from roadgeo.matching.triples import (
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
-#: A place is fitted through a lens once, and again where this much more of the mask's roads agrees.
-_BETTER = 0.05
-#: Stop refining a place below this log10 likelihood, or, after the first and second refinement, below these parts of
+#: Stop refining a place below this log10 likelihood, or, after the first two refinements, below this part of
 #: the best place's: 276 of 277 right places led every other place by a fifth after the first.
-_LEAST_LIKELY, _BEHIND = 0.7, (0.8, 0.9)
+_LEAST_LIKELY, _BEHIND = 0.7, 0.8
 #: A place that explains less than this part of the best place is not refined again after the first refinement. A place
 #: that grew by roads is not refined at all if it explains less as grown: the least of 71 right places explained 0.9.
 _HARDLY = 0.5
@@ -321,7 +319,7 @@ class TripleEstimator:
         best = max((other.log10_likelihood for other in self.verified), default=0.0)
         if place.by_roads and 0.0 < _HARDLY * best > place.log10_likelihood:
             return self._scored(place)
-        for n_points, least in ((150, _BEHIND[0] * best), (300, _BEHIND[1] * best), (None, 0.0)):
+        for n_points, least in ((150, _BEHIND * best), (300, _BEHIND * best), (None, 0.0)):
             place, converged = self._converge(place, n_points, _HARDLY * best)
             if not converged:
                 return place
@@ -368,7 +366,7 @@ class TripleEstimator:
         index, refined, forward = self.index, place.refined, place.agreement.forward
         if not self.options.lens or refined is None:
             return place
-        if any(share > forward - _BETTER and other.same(place) for other, share in self._fitted):
+        if any(share > forward - NOTICEABLE and other.same(place) for other, share in self._fitted):
             return place
         self._fitted.append((place, forward))
         lens = find_lens(refined.matrix, self.scene, index, self.refine_options)

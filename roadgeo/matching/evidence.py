@@ -30,27 +30,25 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import MIN_COS, Scene, in_pixels
+from roadgeo.matching.scene import APART_M, MIN_COS, N_ROUGHLY, Scene, in_pixels
 from roadgeo.matching.shifts import shifted
 
-__all__ = ["Agreement", "Evidence", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
+__all__ = ["SHARES", "Agreement", "Evidence", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.geomspace(0.25, 1.6, 5)
-_SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
+SHARES = np.linspace(0.2, 0.87, 5) ** 2
 #: Range of residuals, in usual deviations; number of bins; number of bins of roads that agree.
 _REACH, _BINS, _AGREEING = 4.0, 24, 18
 #: Share of random roads that run along a road piece, as streets go; the directions of the map's roads are not compared
-#: with the query's. The share of pieces with such a road nearby is rounded to a power of `_STEP`.
-_ALONG, _STEP, _STEPS = 0.42, 0.8, 14
+#: with the query's.
+_ALONG = 0.42
 #: Accuracy of the distance to the query's roads, in cells of its raster.
 _BLUR_CELLS = 0.35
 #: Usual distance between a mapped road and the true road, and usual error of a traced road.
 MAP_SIGMA_M, PIXEL_SIGMA_PX = 1.8, 1.0
 #: This length of road, query and map together, counts as one independent statement.
 STATEMENT_M = 480.0
-#: Width of the frame's pieces by which two places are compared.
-_PIECE_M = 60.0
 #: Most regions along the frame's longer side in which a place may be contradicted; their least width; and the factor by
 #: which pixels are coarser than in the middle of the frame where ground is too far away to count.
 _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
@@ -59,8 +57,8 @@ _HARDLY = 0.1
 #: Least step of the samples along the map's roads, which is at least a cell of the query's raster.
 STEP_M = 12.0
 #: Places nearby: evenly spread shifts of these lengths, and shifts that move one of a few map intersections near the
-#: middle to another intersection around it. All are compared by this number of road points; the best are weighed.
-_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 6
+#: middle to another intersection around it. The best are weighed.
+_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _WEIGHED = (30.0, 320.0), 150, 3, 6
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class Evidence:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
         self._sigma_m = math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
         self.statement_px = statement_px(gsd_m)
-        self._piece_px = in_pixels(_PIECE_M, gsd_m)
+        self._piece_px = in_pixels(APART_M, gsd_m)  # two places are compared by pieces of the frame
         width, height = scene.size
         self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
         self._observed_px = float(scene.observed.sum()) * scene.field_scale**2
@@ -161,7 +159,7 @@ class Evidence:
         on_road = np.isfinite(met[:, 0])
         moved = (Homography(matrix).everywhere(scene.points) - Homography(other).everywhere(scene.points))[on_road]
         across = np.abs((moved * met[on_road, 1:]).sum(axis=1))
-        alike = (across < 2.0 * reach_m) & (np.hypot(*moved.T) < _PIECE_M)
+        alike = (across < 2.0 * reach_m) & (np.hypot(*moved.T) < APART_M)
         return float(alike.mean()) if on_road.any() else 0.0
 
     def on_roads(self, matrix: FloatArray) -> BoolArray:
@@ -249,7 +247,7 @@ class Evidence:
             (self._spiral(reach_m, n_shifts), self._onto_neighbours(matrix, reach_m, near, n_anchors))
         )
         shares = np.empty(len(shifts))
-        thin = max(1, len(scene.points) // _N_POINTS)
+        thin = max(1, len(scene.points) // N_ROUGHLY)
         points, directions, weights = (
             np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions, scene.weights)
         )
@@ -316,14 +314,13 @@ def match_intersections(
     return matched, distance
 
 
-def _anyhow(expected: float) -> int:
-    """Return the share of pieces near at least one of the expected number of roads, as a power of `_STEP`."""
-    share = 1.0 - math.exp(-expected)
-    return min(max(round(math.log(max(share, 1e-9)) / math.log(_STEP)), 0), _STEPS)
+def _anyhow(expected: float) -> float:
+    """Return the natural logarithm of the share of pieces near at least one of the expected number of roads."""
+    return round(math.log(max(1.0 - math.exp(-expected), float(SHARES[0]))), 1)
 
 
 @lru_cache(maxsize=256)
-def _log_ratios(anyhow: int, blur: float) -> FloatArray:
+def _log_ratios(anyhow: float, blur: float) -> FloatArray:
     """Return log likelihood ratios (sigma, share, bin) of a residual, against a road that lies there by chance.
 
     Deviations, residuals and the `blur` are in usual deviations; the last bin holds roads without a road within reach.
@@ -331,8 +328,8 @@ def _log_ratios(anyhow: int, blur: float) -> FloatArray:
     sigmas = np.hypot(_SIGMAS, blur)[:, None]
     residual = (np.arange(_BINS) + 0.5) * (_REACH / _BINS)
     density = math.sqrt(2.0 / math.pi) / sigmas * np.exp(-0.5 * (residual / sigmas) ** 2)
-    ratio = np.concatenate((density * (_REACH / _STEP**anyhow), np.zeros((len(sigmas), 1))), axis=1)
-    return np.asarray(np.log((1.0 - _SHARES)[None, :, None] * ratio[:, None, :] + _SHARES[None, :, None]))
+    ratio = np.concatenate((density * (_REACH * math.exp(-anyhow)), np.zeros((len(sigmas), 1))), axis=1)
+    return np.asarray(np.log((1.0 - SHARES)[None, :, None] * ratio[:, None, :] + SHARES[None, :, None]))
 
 
 #: Factor by which weighted sums of random signs may exceed their standard deviation times z more often than a normal

@@ -27,16 +27,15 @@ from roadgeo.matching.refinement import (
     refine_between,
     weight_on_roads,
 )
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import N_ROUGHLY, NOTICEABLE, Scene, at_least
 
 __all__ = ["measure_corners", "measured", "refine_beside", "with_honest_corners"]
 
-#: If this share of the mask's roads agrees, no cell of the frame was left out; and the part of that share that a fit to
-#: all cells may lose.
-_WHOLE, _LEAST_LOST = 0.9, 0.03
-#: Corners are moved one by one by this distance, to see whether the fit comes back: metres in the middle of the frame,
-#: and at least this number of pixels; the number of road points of such fits; and the most rounds.
-_BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = 24.0, 8.0, 150, 5
+#: If this share of the mask's roads agrees, no cell of the frame was left out.
+_WHOLE = 0.9
+#: Corners are moved one by one by this distance, to see whether the fit comes back, metres in the middle of the frame;
+#: and the most rounds.
+_BESIDE_M, _MOST_ROUNDS = 24.0, 5
 #: A fit has come back if no corner is off by more than this part of the step. Another fit is better if this share of
 #: the road points lies on roads in addition.
 _BACK, _BETTER = 0.125, 0.006
@@ -98,7 +97,7 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Place) -> Place:
     if whole is None or not estimator.may_be(whole.matrix):
         return best
     moved = _moved(best, whole)
-    return moved if moved.agreement.forward >= best.agreement.forward - _LEAST_LOST else best
+    return moved if moved.agreement.forward >= best.agreement.forward - NOTICEABLE else best
 
 
 def _fit_between_carriageways(estimator: TripleEstimator, best: Place) -> tuple[Place, Scene]:
@@ -116,14 +115,14 @@ def refine_beside(place: Place, scene: Scene, options: RefineOptions) -> Refined
     Each corner of the frame is moved in turn, while the others stay. A fit that does not come back may be better.
     """
     options, nothing, index = replace(options, least_share=0.0), np.full(len(scene.intersections), -1), place.index
-    step_m = max(_BESIDE_M, _BESIDE_PX * place.gsd_m)
+    step_m = at_least(_BESIDE_M, place.gsd_m)
 
     def stays_away(fit: Refined) -> bool:
         moved = np.hypot(*(Homography(fit.matrix).everywhere(scene.corners) - place.corners).T)
         return bool(moved.max() > _BACK * step_m)
 
     starts = _beside(place, step_m / place.gsd_m)
-    tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
+    tried = [refine(start, scene, index, nothing, options, N_ROUGHLY, held=True) for start in starts]
     weights = {weight_on_roads(fit.matrix, scene, index): fit for fit in tried if fit is not None and stays_away(fit)}
     better = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None
     needed = weight_on_roads(place.matrix, scene, index) + _BETTER * len(scene.points)

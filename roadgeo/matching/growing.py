@@ -16,8 +16,9 @@ from roadgeo.kernels.roads import screen
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
-from roadgeo.matching.road_search import PERSPECTIVE_SIGMA, Turnout
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.refinement import RefineOptions
+from roadgeo.matching.road_search import Turnout
+from roadgeo.matching.scene import MAX_INTERSECTIONS, MIN_COS, Scene, and_pixels
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import Proposals, Sweep
 
@@ -39,14 +40,14 @@ MAX_SCALE_RATIO = 2.0
 MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
 #: Number of road points near the anchor, the share of them that must lie near roads, and the radius: the map's part in
 #: metres, and the mask's in pixels.
-_SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, (8.0, 4.0)
+_SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, and_pixels(8.0)
 #: Standard deviation of an intersection's place, and the greatest search radius, each in metres and in pixels.
-_SIGMA, _RADIUS = (3.5, 1.5), (20.0, 5.0)
+_SIGMA, _RADIUS = and_pixels(3.5), and_pixels(20.0)
 #: Sequential test: share of intersections that match at a right place and at a wrong place, and the nats lost before it
 #: gives up.
 _HIT_RATE, _CHANCE_RATE, _PATIENCE = 0.45, 0.08, 6.0
-#: Least matches besides the seeds; most intersections of a growth, the nearest to the anchor.
-_MIN_MATCHED, _MAX_POINTS = 2, 1000
+#: Least matches besides the seeds.
+_MIN_MATCHED = 2
 
 
 def screen_proposals(scene: Scene, index: ReferenceIndex, proposals: Proposals, looked_at: IntArray) -> IntArray:
@@ -82,13 +83,13 @@ def grow_proposals(
         return []
     # The query: intersections outwards from the anchor, and the neighbours on which each proposal is based.
     xy, anchor = scene.intersections.xy, proposals.anchor
-    order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[:_MAX_POINTS]
+    order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[:MAX_INTERSECTIONS]  # the nearest to the anchor
     partners = np.ascontiguousarray(proposals.partners[chosen])
     neighbours = np.ascontiguousarray(scene.neighbours[:, : partners.shape[1]])
     matched = np.empty((len(chosen), len(xy)), np.int64)
     matrices = np.empty((len(chosen), 3, 3))
     ratios = np.empty(len(chosen))
-    perspective = camera.perspective_sigma(PERSPECTIVE_SIGMA)
+    perspective = camera.perspective_sigma(RefineOptions.perspective_sigma)
     limits = GrowthLimits(_SIGMA, _RADIUS, MIN_COS, perspective, _HIT_RATE, _CHANCE_RATE, _PATIENCE)
     grow_each(
         GrowthQuery(xy, scene.branches, neighbours, order, scene.half_size, anchor),

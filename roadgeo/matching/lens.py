@@ -12,7 +12,7 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.structs import Held
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Equations, Refined, RefineOptions
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import NOTICEABLE, Scene, and_pixels
 from roadgeo.roads.intersections import Intersections
 
 __all__ = [
@@ -26,8 +26,6 @@ __all__ = [
 
 #: No other fit is tried if this share of the mask's roads agrees.
 ENOUGH = 0.8
-#: Least gain in the share of road points on roads for a fit without a lens that grew over more of the frame.
-_BETTER = 0.02
 #: Significance of k1 in its standard deviations, and the least movement of the frame's corners, pixels.
 _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 #: Cells along each side of the frame; the part of the best cell's share of road points on roads that cells need where a
@@ -37,7 +35,7 @@ _CORE, _N_HELD = (10, 0.75), 50
 FEWEST = 12
 #: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the
 #: frame that meets wrong roads bends the whole fit.
-_MAX_RADIUS = (10.0, 5.0)
+_MAX_RADIUS = and_pixels(10.0)
 #: Starting values of k1, tried in turn until a fit explains enough.
 _STARTS = (0.0, -0.15, -0.08, 0.08)
 #: A fit that meets less than this share of the road points is dropped.
@@ -68,7 +66,7 @@ def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refineme
     """
     before = Equations(matrix, scene, index, refinement).meet().mean()
     fitted = fit_lens(matrix, scene, index, refinement, None)
-    return fitted if fitted is not None and fitted.share > before + _BETTER else None
+    return fitted if fitted is not None and fitted.share > before + NOTICEABLE else None
 
 
 def fit_lens(

@@ -39,13 +39,12 @@ from roadgeo.matching.pairs import (
     type_keys,
 )
 from roadgeo.matching.refinement import denormalise, normalise
+from roadgeo.matching.scene import MAX_INTERSECTIONS
 from roadgeo.matching.search import SearchOptions
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["PAPER", "PairMatch", "PairOptions", "match_pairs", "read_options", "thresholds"]
 
-#: Most intersections of a query that form tuples, chosen at random; all intersections still judge hypotheses.
-_MAX_TUPLE_INTERSECTIONS = 1000
 #: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
 _TESTS_PER_CALL = 5_000_000
 #: Seconds of a usual machine, on masks of Liège: for a query tuple, for a candidate, and for an intersection that
@@ -292,8 +291,8 @@ class _Search:
         """Draw l query tuples with their types, those rare in the reference first, at random within a type."""
         options, rng, tuples = self.options, self.rng, self.index.tuples
         chosen = np.arange(len(self.query))
-        if len(chosen) > _MAX_TUPLE_INTERSECTIONS:
-            chosen = rng.choice(chosen, _MAX_TUPLE_INTERSECTIONS, replace=False)
+        if len(chosen) > MAX_INTERSECTIONS:  # all of them still judge hypotheses
+            chosen = rng.choice(chosen, MAX_INTERSECTIONS, replace=False)
         pairs = list_pairs(self.query, chosen, np.inf, options.delta_angle_deg)
         keys = type_keys(self.codes, pairs)
         order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))

@@ -27,6 +27,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
+from roadgeo.matching.evidence import SHARES
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.scene import Scene, in_pixels
@@ -34,9 +35,6 @@ from roadgeo.matching.shifts import Shift, move_about, shifted
 
 __all__ = ["Picture", "by_picture"]
 
-#: Grid of the marginalised shares: of the map's roads that are missing, and the density of false roads.
-_MISSING = np.array([0.05, 0.15, 0.3, 0.5, 0.75])
-_FALSE = np.array([0.1, 0.3, 0.6, 1.0])
 #: Levels of log odds: this number for each nat, up to this log odds either way.
 _FINE, _SUREST = 16.0, 5.5
 #: Side of the ground over which the usual probability of road is taken, metres. A frame of some kilometres shows town
@@ -94,7 +92,7 @@ class Picture:
         ground = ground or self._around(matrix, self._fine_cell_m(matrix), 0.0)
         rectified = self._rectify(matrix, ground)
         if rectified is None:
-            return np.zeros((len(_MISSING), len(_FALSE)))
+            return np.zeros((len(SHARES), len(SHARES)))
         levels, template, (column, row) = rectified
         n, (rows, columns) = levels.on.shape[1], ground.roads.shape
         top, left = max(row, 0), max(column, 0)
@@ -152,7 +150,7 @@ class Picture:
             Least distance between two places of a turn, and from the place itself.
         """
         scene, gsd_m = self.scene, self._gsd_m(matrix)
-        missing, false = divmod(int(self._nats(matrix).argmax()), len(_FALSE))
+        missing, false = divmod(int(self._nats(matrix).argmax()), len(SHARES))
         center, corners = (Homography(matrix).everywhere(points) for points in (scene.center, scene.corners))
         radius_m = float(np.hypot(*(corners - center).T).max())
         cell_m = max(_ROAD_M, self._fine_cell_m(matrix), 2.0 * (reach_m + radius_m) / _MOST_CELLS)
@@ -252,7 +250,7 @@ def _levels(scene: Scene, smaller: int, around: int) -> _Levels:
     sure = np.clip(probability, surest, 1.0 - surest)
     seen_odds = np.log(sure / (1.0 - sure)) - np.log(nearby / (1.0 - nearby)) + math.log(usual / (1.0 - usual))
     cells = np.round((np.clip(seen_odds, -_SUREST, _SUREST) + _SUREST) * _FINE).astype(np.uint8)
-    missing, false = _MISSING[:, None], usual * _FALSE[:, None]
+    missing, false = SHARES[:, None], usual * SHARES[:, None]
     on_road = np.log((1.0 - missing) * road + missing * other)
     elsewhere = np.log((1.0 - false) * other + false * road)
     return _Levels(np.where(shown, cells, np.uint8(neutral)), scene.field_scale * smaller, neutral, on_road, elsewhere)

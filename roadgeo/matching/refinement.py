@@ -17,7 +17,7 @@ from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import AdjustLimits, Held, Met, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.scene import APART_M, MIN_COS, N_ROUGHLY, NOTICEABLE, Scene, and_pixels, at_least
 
 __all__ = [
     "Equations",
@@ -42,15 +42,12 @@ _SIGMA_M, _SIGMA_PX = 1.2, 0.9
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
-#: Errors of the map and of the mask are correlated over about this length of road, metres: closer points are not
-#: independent observations.
-_CORRELATION_M = 60.0
 #: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
 #: greater, they keep their sign as much further. Fitted to the corners of training masks.
 _USUAL_RMS = 0.7
-#: How far off a homography that is held near its start may be, metres and pixels. With fewer matches it is held: they
+#: How far off a homography that is held near its start may be, metres. With fewer matches it is held: they
 #: alone would not determine a homography, and the start would be forgotten.
-_HELD, _FEW_MATCHES = (5.0, 3.0), 8
+_HELD_M, _FEW_MATCHES = 5.0, 8
 #: Iterations, which end where nothing moves by more, metres.
 _N_ITERATIONS, _TOLERANCE_M = 15, 0.02
 #: Accuracy of the map, metres, and of the mask, pixels, as a whole, which no number of points improves: lines are drawn
@@ -76,7 +73,7 @@ class RefineOptions:
 
     perspective_sigma: float = 0.5
     least_share: float = 0.5
-    max_radius: tuple[float, float] = (20.0, 10.0)
+    max_radius: tuple[float, float] = and_pixels(20.0)
 
 
 @dataclass(frozen=True)
@@ -170,7 +167,7 @@ class Equations:
         self.prior[6:8] = (self.sigma_m / self.unit / options.perspective_sigma) ** 2
         self.prior[8] = (self.sigma_m / self.unit / _K1_SIGMA) ** 2
         spacing_m = scene.road_length_px * gsd / max(len(scene.points), 1)
-        self.weight = min(1.0, spacing_m * step / _CORRELATION_M)
+        self.weight = min(1.0, spacing_m * step / APART_M)
         xy, along, cells = _samples(scene, step)
         half_side = max(scene.size) / 2.0 / scene.half_size
         self.samples = RoadSamples(xy, along, cells, self.weight, half_side)
@@ -296,7 +293,7 @@ def refine(
     chosen[chosen] = support >= _LEAST_SUPPORT
     pairs = equations.pairs(scene.intersections.xy[chosen], index.xy[matched[chosen]], _INTERSECTION_WEIGHT)
     grid = _grid(6 if held or len(pairs.query) < _FEW_MATCHES else 0)
-    weight = 8.0 / 36.0 * (equations.sigma_m / max(_HELD[0], _HELD[1] * equations.gsd)) ** 2
+    weight = 8.0 / 36.0 * (equations.sigma_m / at_least(_HELD_M, equations.gsd)) ** 2
     return equations.adjust(pairs, Held(grid, equations.places(grid), weight))
 
 
@@ -307,15 +304,13 @@ def refine(
 
 #: Two roads at these distances, metres, are a single road on the map if their nearest points on the map lie within this
 #: part of their distance from each other.
-_APART_M, _MERGED = (3.0, 30.0), 0.35
+_SIDE_BY_SIDE_M, _MERGED = (3.0, 30.0), 0.35
 #: The nearest point beside a road point lies within half the step along the road, or a little more.
 _BESIDE = 0.55
 #: Intersections within this multiple of the step belong to such a road: the map has them in the middle too.
 _NEAR = 2.0
-#: A smaller share of the points does not bend a fit.
-_FEW = 0.03
-#: The middle depends on the fit, and the fit on the middle: first about this many points are used, then all.
-_ROUNDS = (200, None)
+#: The middle depends on the fit, and the fit on the middle: first some points are used, then all.
+_ROUNDS = (N_ROUGHLY, None)
 
 
 def refine_between(
@@ -349,12 +344,12 @@ def between_carriageways(
         return scene, matched
     at, along, gsd = points_on_map(matrix, scene)
     across, step_px = np.empty_like(at), scene.road_length_px / len(at)
-    roads_alongside(at, along, _BESIDE * step_px * gsd, *_APART_M, MIN_COS, across)
+    roads_alongside(at, along, _BESIDE * step_px * gsd, *_SIDE_BY_SIDE_M, MIN_COS, across)
     apart = np.hypot(*across.T)
-    reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
+    reach = np.where(np.isfinite(apart), apart, 0.0) + _SIDE_BY_SIDE_M[0]
     feet = [_nearest(start, along, reach, index) for start in (at, at + across)]
     merged = np.hypot(*(feet[0] - feet[1]).T) < _MERGED * apart  # False for NaN
-    if merged.mean() < _FEW:
+    if merged.mean() < NOTICEABLE:
         return scene, matched
     points = scene.points.copy()
     points[merged] = Homography(matrix).inverse().everywhere(at[merged] + 0.5 * across[merged])

@@ -32,8 +32,9 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture, by_picture
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import refine
+from roadgeo.matching.scene import N_ROUGHLY, at_least
 from roadgeo.matching.search import Search
-from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.shifts import SAME_M, Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
 __all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
@@ -42,14 +43,10 @@ __all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "similar_
 _TURNS_DEG = tuple(90.0 * k for k in range(4))
 #: Most and fewest other places by which a gap is judged; their least spacing (log10).
 _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
-#: Most times that a rival may turn out to be better.
-_MOST_TURNS = 12
-
-
-#: A place is not compared further if it leads all places nearby by the first score, is contradicted by less than the
-#: second, and the best place nearby explains less than this part of it: streets do not repeat there. Four of 274
-#: mirrored masks led by the first, where a city is like its mirror image: they were contradicted by 8.7 and more.
-_CERTAIN, _CONTRADICTED, _REPEATING = 12.0, 1.0, 0.5
+#: A place is not compared further if it leads all places nearby by this score, nothing contradicts it, and the best
+#: place nearby explains less than this part of it: streets do not repeat there. Four of 274 mirrored masks led by it,
+#: where a city is like its mirror image: they were contradicted by 8.7 and more.
+_CERTAIN, _REPEATING = 12.0, 0.5
 #: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
 #: that part is up to a tenth, at right places nine tenths and more.
 _MAY_LEAD = 0.5
@@ -57,9 +54,8 @@ _MAY_LEAD = 0.5
 #: places, on masks with up to half the roads gone, false, stale or bent, the share contradicted is 0 for nine of ten
 #: and at most 0.09; at the best wrong places of mirrored masks its median is 0.16.
 _PENALTY = 60.0
-#: Number of the likeliest places met by the search that are compared; and number of road points for the rough
-#: refinement of places around.
-N_LIKELIEST, _N_POINTS = 12, 200
+#: Number of the likeliest places met by the search that are compared, and most times that one turns out to be better.
+N_LIKELIEST = 12
 #: Number of the likeliest places around that are fully refined.
 _N_FITTED = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
@@ -69,14 +65,11 @@ _APART, _SAME = 0.04, 0.67
 #: are not independent; where they favour different places, it counts against.
 #: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
-#: How far around a place the picture is compared, metres: farther where the lead over places near may be enough, and is
-#: not clear. Correlations of each turn, and the likeliest of all turns that are weighed.
-_REACHES_M, _PEAKS, _WEIGHED = (1000.0, 4000.0), 12, 4
-#: The picture's places are different if their middles are further apart than this, metres and pixels.
-_BESIDE_M, _BESIDE_PX = 30.0, 8.0
-#: Streets around a place, and the blocks beside it.
-_AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
-_NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
+#: The likeliest of the picture's places around that are weighed.
+_WEIGHED = 4
+#: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
+_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=_N_FITTED)
+_AROUND = replace(_NEARBY, reach_m=4000.0, n_places=40)
 
 
 class Compared(NamedTuple):
@@ -172,7 +165,7 @@ class Rivals:
         ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]
         gsd_m = ranked[0].gsd_m
         best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
-        for _ in range(_MOST_TURNS):
+        for _ in range(N_LIKELIEST):
             compared = self._compare_by_picture(estimator, estimator.refine_whole(best), ranked)
             if compared.rival is None or _lead(compared.rival, compared) < self.needed:
                 break
@@ -182,13 +175,13 @@ class Rivals:
     def _compare_by_picture(self, estimator: TripleEstimator, best: Place, ranked: Sequence[Place]) -> Place:
         """Compare a place with those that were met, and with those around, by the picture."""
         picture = Picture(best.scene, best.index, best.gsd_m)
-        apart_m = max(_BESIDE_M, _BESIDE_PX * picture.gsd_m)
+        apart_m = at_least(SAME_M, picture.gsd_m)
         others = [
             by_picture(place, picture.gsd_m) for place in ranked if math.dist(place.center, best.center) > apart_m
         ]
         likelihood, lead, rival = picture.weigh(best.matrix), math.inf, None
-        for reach_m in _REACHES_M:
-            others += _around(picture, best, reach_m, apart_m, estimator)
+        for around in (_NEARBY, _AROUND):
+            others += _around(picture, best, around.reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.log10_likelihood, default=None)
             lead = picture.lead(likelihood, -math.inf if rival is None else rival.log10_likelihood)
             if not _MAY_LEAD * self.needed <= lead < 2.0 * self.needed:
@@ -213,7 +206,7 @@ class Rivals:
             return None
         started = time.perf_counter()
         best = max(ranked[:N_LIKELIEST], key=lambda place: place.log10_likelihood - _penalty(place))
-        for _ in range(_MOST_TURNS):
+        for _ in range(N_LIKELIEST):
             key = best, *ranked[: 1 + N_LIKELIEST]
             compared = self._compared.get(key) or self._compare(estimator, best, ranked)
             self._compared[key] = compared
@@ -231,7 +224,7 @@ class Rivals:
         penalty, own = _penalty(best), best.log10_likelihood
         likeliest = next((other.log10_likelihood for other in ranked if not other.same(best)), 0.0)
         lead = min(best.score, own - max(likeliest, 0.0))
-        if lead >= _CERTAIN and penalty < _CONTRADICTED and max(likeliest, estimator.nearby(best)) < _REPEATING * own:
+        if lead >= _CERTAIN and not penalty and max(likeliest, estimator.nearby(best)) < _REPEATING * own:
             return best.but(score=lead - penalty, rival=None)
         if time.perf_counter() > self._deadline:
             return best.but(score=min(lead, 0.0), rival=None)
@@ -298,7 +291,7 @@ def _around(picture: Picture, best: Place, reach_m: float, apart_m: float, estim
     """Return the likeliest other places around a place, shifted or turned, that agree with the hints."""
     if estimator.near is not None:
         reach_m = min(reach_m, 2.0 * estimator.near[2])
-    peaks = picture.correlate(best.matrix, reach_m, _TURNS_DEG, _PEAKS, apart_m)
+    peaks = picture.correlate(best.matrix, reach_m, _TURNS_DEG, N_LIKELIEST, apart_m)
     allowed = (place for place in peaks if estimator.may_be(place.matrix))
     return [picture.settle(place) for place in islice(allowed, _WEIGHED)]
 
@@ -321,7 +314,7 @@ def similar_places(
         proposed += [(shift.share, move_about(best.center, shift) @ turned) for shift in shifts]
     proposed.sort(key=lambda place: -place[0])
     starts = (Place(scene, index, matrix) for _, matrix in proposed[: around.n_places])
-    fits = (fitted(start, match, _N_POINTS) for start in starts)
+    fits = (fitted(start, match, N_ROUGHLY) for start in starts)
     roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
     finely = (fitted(other.place, match, None) for other in roughly[:_N_FITTED])
     return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[_N_FITTED:]]

@@ -30,15 +30,14 @@ from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
 from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
-from roadgeo.matching.refinement import denormalise
-from roadgeo.matching.scene import AGREE_DEG, LARGE_PIXEL_M, MIN_COS, Scene
+from roadgeo.matching.refinement import RefineOptions, denormalise
+from roadgeo.matching.scene import AGREE_DEG, LARGE_PIXEL_M, MIN_COS, Scene, and_pixels
 from roadgeo.matching.search import ALONE, Ahead
-from roadgeo.matching.triples import farthest_first, larger
+from roadgeo.matching.triples import MAX_ANCHORS, farthest_first, larger
 from roadgeo.roads.intersections import unpack_branches
 
 __all__ = [
     "COARSE_PIXEL_M",
-    "PERSPECTIVE_SIGMA",
     "RADIUS_M",
     "RING_STEP",
     "RoadGrower",
@@ -160,14 +159,13 @@ _PER_RADIAN = WHOLE_TURN / math.tau
 _TURN_STEPS = np.radians(3.0 * np.arange(-2, 3))
 _SCALE_STEPS = np.array([0.96, 1.04])
 
-#: Roads nearer than this, metres, that run straight away from the intersection, with at least this cosine, are left
-#: out: they are its own branches, which agree by construction. The right place then stands out more.
-_OWN_M, _OWN_COS = 150.0, 0.95
+#: Roads nearer than this, metres, that run straight away from the intersection are left out: they are its own branches,
+#: which agree by construction. The right place then stands out more.
+_OWN_M = 150.0
 #: A scale at which fewer points are in reach is not tried.
 _LEAST_POINTS = 15
-#: Number of the best proposals that are judged anew, number of road points that judge them, and their greatest
-#: distance, metres. A coarse map multiplies all lengths.
-_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 400, 160, 260.0
+#: Number of the best proposals that are judged anew, and number of road points that judge them, as far as rings reach.
+_KEPT, _WIDE_POINTS = 400, 160
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
 _TRIAL = VoteRates(0.55, 1.5)
@@ -257,11 +255,11 @@ class Voter:
         scene = self.scene
         offsets = scene.dense_points - scene.intersections.xy[anchor]
         away = np.hypot(*offsets.T)
-        (near,) = np.nonzero(away < WIDE_RADIUS_M * self.index.coarseness / self.scales[0])
+        (near,) = np.nonzero(away < RADIUS_M * self.index.coarseness / self.scales[0])
         order = near[np.argsort(away[near], kind="stable")]
         offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
         angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
-        radial = np.abs((offsets * directions).sum(axis=1)) > _OWN_COS * away
+        radial = np.abs((offsets * directions).sum(axis=1)) > math.cos(_TURN) * away
         return _Around(offsets, away, angles, radial)
 
     def _mark(self, around: _Around) -> AnyArray:
@@ -275,7 +273,7 @@ class Voter:
 
     def _wide(self, around: _Around) -> RoadPoints:
         """Choose the points that judge proposals anew at each scale, evenly by distance."""
-        usable = np.searchsorted(around.away, WIDE_RADIUS_M * self.index.coarseness / self.scales)
+        usable = np.searchsorted(around.away, RADIUS_M * self.index.coarseness / self.scales)
         n = np.minimum(usable, _WIDE_POINTS)
         starts = np.concatenate(([0], np.cumsum(n)))
         scale = np.repeat(np.arange(len(n)), n)
@@ -296,9 +294,7 @@ _MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
 #: right ones at 0.5 and more, on masks with 40 % of the roads gone and 40 % false.
 _LEAST_SHARE = 0.3
 #: Points within the sum of metres and pixels of a road lie on it.
-_TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
-#: Prior standard deviation of the two perspective parameters, while a place grows.
-PERSPECTIVE_SIGMA = 0.4
+_TOLERANCE_M, _TOLERANCE_PX = and_pixels(7.0)
 #: Proposals of an intersection that are kept after each of the first stages because they are closest to roads, and
 #: those kept for most votes. With all 40 kept, 396 intersections led to the place of a broken mask; now 395 do, in half
 #: the time. In lattices 255 of 266 do, in a quarter.
@@ -310,7 +306,7 @@ class RoadGrower:
 
     def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions) -> None:
         self.scene, self.index = scene, index
-        perspective = camera.perspective_sigma(PERSPECTIVE_SIGMA)
+        perspective = camera.perspective_sigma(RefineOptions.perspective_sigma)
         self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, _GO_ON, _SURE)
         thin = max(1, len(scene.dense_points) // _MAX_POINTS)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
@@ -346,8 +342,6 @@ class RoadGrower:
 #: The smallest pixels that are tried on a map of coarseness 1; a coarse map multiplies them by its coarseness.
 COARSE_PIXEL_M = 0.35
 
-#: Number of intersections of the query that vote, spread over the frame from its middle outwards.
-_MAX_ANCHORS = 30
 #: Voting ends early, but not before the second number of intersections, once the first number of places was tried on a
 #: map of 15,000 intersections, all parts together. On a larger map the number of places grows by the root of the ratio.
 #: In a lattice every crossing fits in four turns.
@@ -356,9 +350,8 @@ _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
 _MAX_GROWN, _MAX_KEPT = 80, 2
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
-#: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
-#: width on the ground lies in this range, metres.
-_TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
+#: Greatest width of roads, metres: no scales are tried at which they would be wider.
+_ROAD_WIDTH_M = 75.0
 
 
 def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0) -> tuple[float, float]:
@@ -371,10 +364,8 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
     if coarseness != 1.0:
         low = max(low, coarseness * COARSE_PIXEL_M)
     high = max(high, low)
-    if not road_width_px >= _TELLING_WIDTH_PX:  # NaN: not known
-        return low, high
-    least, most = (width / road_width_px for width in _ROAD_WIDTH_M)
-    return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
+    most = _ROAD_WIDTH_M / road_width_px  # NaN: not known
+    return low, most if low < most < high else high
 
 
 @dataclass
@@ -445,7 +436,7 @@ class RoadSearch:
     def rounds(self) -> Iterator[RoadRound]:
         """Yield the places that grew from each anchor's proposals."""
         xy = self.scene.intersections.xy
-        anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS)
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), MAX_ANCHORS)
         for n, votes in enumerate(self.ahead.map(self.voter.votes, anchors)):
             if not self.turnout.includes(n):
                 return

@@ -24,10 +24,17 @@ from roadgeo.roads.vectorization import vectorize
 
 __all__ = [
     "AGREE_DEG",
+    "APART_M",
     "LARGE_PIXEL_M",
+    "MAX_INTERSECTIONS",
     "MIN_COS",
+    "NOTICEABLE",
+    "N_NEIGHBOURS",
+    "N_ROUGHLY",
     "Query",
     "Scene",
+    "and_pixels",
+    "at_least",
     "in_pixels",
     "prepare_scene",
     "query_neighbours",
@@ -38,8 +45,14 @@ __all__ = [
 
 
 #: Most intersections, the nearest to the middle of the frame, which locate a mask as well and bound time and memory;
-#: and most neighbours of each.
-_MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
+#: most of them for what takes long for each; and most neighbours of each.
+_MAX_INTERSECTIONS, MAX_INTERSECTIONS, N_NEIGHBOURS = 5000, 1000, 12
+#: Road points by which many places are compared roughly.
+N_ROUGHLY = 200
+#: Roads nearer than this to each other, metres, err alike.
+APART_M = 60.0
+#: A smaller share of the roads, more or less, makes no difference.
+NOTICEABLE = 0.025
 #: Most points along the roads, and their least spacing, pixels: a few for quick comparisons, more for an intersection's
 #: surroundings.
 _POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
@@ -52,6 +65,18 @@ MIN_COS = math.cos(math.radians(AGREE_DEG))
 #: Larger pixels, metres, hardly show the surroundings of an intersection: the search around a hint `near` goes no
 #: further than frames of such pixels reach, and a length on the ground is never fewer pixels than of these.
 LARGE_PIXEL_M = 5.0
+#: The mask's roads are traced to some pixels, as the map's are drawn to some metres: so many metres for each pixel.
+_TRACED_M = 2.5
+
+
+def at_least(metres: float, gsd_m: float) -> float:
+    """Return a distance on the ground, or as far as roads are traced in pixels of `gsd_m` metres."""
+    return metres * max(1.0, gsd_m / _TRACED_M)
+
+
+def and_pixels(metres: float) -> tuple[float, float]:
+    """Return a tolerance's part on the map, metres, and its part in the mask, pixels; both are added."""
+    return metres, metres / _TRACED_M
 
 
 def in_pixels(metres: float, gsd_m: float) -> float:
@@ -207,7 +232,7 @@ def prepare_scene(
     else:
         shown = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
     intersections = _nearest(intersections, Frame(*size).plane_center, _MAX_INTERSECTIONS)
-    neighbours = query_neighbours(intersections.xy, _N_NEIGHBOURS)
+    neighbours = query_neighbours(intersections.xy, N_NEIGHBOURS)
     return Scene(
         size=size,
         intersections=intersections,

@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import N_ROUGHLY, Scene
 
 __all__ = [
     "Drawn",
@@ -39,12 +39,15 @@ _ALONG = math.radians(18.0)
 
 
 #: A place nearer than this to a better place, metres, is the same place.
-APART_M = 25.0
+SAME_M = 30.0
+#: Side of the raster's cells, and step of the shifts, metres; and width of the roads that are drawn: the motion of a
+#: point by a step of shift and of turn must fit in.
+_CELL_M, _ROAD_M = 10.0, 20.0
 
 
 @dataclass(frozen=True)
 class LocalSearchOptions:
-    """The reach and the resolution of a local search.
+    """The reach of a local search.
 
     Attributes
     ----------
@@ -52,21 +55,12 @@ class LocalSearchOptions:
         Greatest shift, east and north.
     turn_deg : float
         Greatest turn, either way.
-    cell_m : float
-        Side of the raster's cells, and step of the shifts.
-    road_m : float
-        Width of the roads that are drawn: the motion of a point by a step of shift and of turn must fit in.
-    max_points : int
-        Road points of the query that vote.
     n_places : int
         Places returned.
     """
 
     reach_m: float = 350.0
     turn_deg: float = 6.0
-    cell_m: float = 5.0
-    road_m: float = 15.0
-    max_points: int = 300
     n_places: int = 12
 
 
@@ -112,7 +106,7 @@ def search_nearby(
         Keeps the roads that were drawn, for starts about the same middle, by the same options.
     """
     options = options or LocalSearchOptions()
-    thin = max(1, len(scene.points) // options.max_points)
+    thin = max(1, len(scene.points) // N_ROUGHLY)
     to_map = Homography(start)
     points = to_map(scene.points[::thin])
     ends = to_map(scene.points[::thin] + scene.directions[::thin])
@@ -125,7 +119,7 @@ def search_nearby(
     radius = float(np.hypot(*(frame - center).T).max())
     drawn, reach_m = {} if drawn is None else drawn, radius + options.reach_m
     key = (*np.round(center, 3).tolist(), round(reach_m, 3))
-    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m, options)
+    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m)
     best: list[Shift] = []
     for turn in _turns(radius, options):
         turned = Homography(move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)))
@@ -135,16 +129,14 @@ def search_nearby(
 
 def _turns(radius_m: float, options: LocalSearchOptions) -> FloatArray:
     """Return the turns to try: from turn to turn the frame's corners move by less than a road's width."""
-    step = min(math.degrees(0.8 * options.road_m / radius_m), 1.5)
+    step = min(math.degrees(0.8 * _ROAD_M / radius_m), 1.5)
     n = math.ceil(options.turn_deg / step)
     return np.asarray(np.linspace(-options.turn_deg, options.turn_deg, 2 * n + 1))
 
 
-def _draw_layers(
-    index: ReferenceIndex, center: FloatArray, reach_m: float, options: LocalSearchOptions
-) -> tuple[AnyArray, FloatArray]:
+def _draw_layers(index: ReferenceIndex, center: FloatArray, reach_m: float) -> tuple[AnyArray, FloatArray]:
     """Draw the roads around a point: (16, rows, columns) uint8, 1 on roads; and the first cell's corner (2,)."""
-    cell = options.cell_m
+    cell = _CELL_M
     side = math.ceil(2.0 * (reach_m + 2.0 * cell) / cell)
     origin = center - side * cell / 2.0
     a, b = index.segments[:, :2].astype(float) - origin, index.segments[:, 2:].astype(float) - origin
@@ -156,7 +148,7 @@ def _draw_layers(
     for d, layer in enumerate(layers):
         away = np.abs((d + 0.5) * math.pi / _DIRECTIONS - angle)
         chosen = lines[np.minimum(away, math.pi - away) <= _ALONG]
-        cv2.polylines(layer, list(chosen), False, 1, max(1, round(options.road_m / cell)), cv2.LINE_8, 4)
+        cv2.polylines(layer, list(chosen), False, 1, max(1, round(_ROAD_M / cell)), cv2.LINE_8, 4)
     return layers, origin
 
 
@@ -169,8 +161,8 @@ def _best_shifts(
     options: LocalSearchOptions,
 ) -> list[Shift]:
     """Return the best shifts of a turn."""
-    reach, side = round(options.reach_m / options.cell_m), layers.shape[1]
-    cells = np.floor((points - origin) / options.cell_m).astype(int) - reach
+    reach, side = round(options.reach_m / _CELL_M), layers.shape[1]
+    cells = np.floor((points - origin) / _CELL_M).astype(int) - reach
     angle = np.arctan2(*(ends - points).T[::-1]) % math.pi
     direction = np.minimum((angle / math.pi * _DIRECTIONS).astype(int), _DIRECTIONS - 1)
     span = 2 * reach + 1
@@ -189,7 +181,7 @@ def _best_shifts(
     away = np.hypot(rows - reach, columns - reach)  # the nearest of equal peaks: where blocks repeat, a neighbour
     order = np.lexsort((away, -votes[rows, columns].astype(int)))[:most]
     return [
-        Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, 1.0, int(votes[r, c]) / len(points))
+        Shift((c - reach) * _CELL_M, (r - reach) * _CELL_M, turn, 1.0, int(votes[r, c]) / len(points))
         for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True)
     ]
 
@@ -198,7 +190,7 @@ def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
     """Return the best shifts that lie apart from better ones."""
     kept: list[Shift] = []
     for shift in sorted(shifts, key=lambda shift: (-shift.share, math.hypot(shift.east_m, shift.north_m))):
-        if all(math.hypot(shift.east_m - k.east_m, shift.north_m - k.north_m) >= APART_M for k in kept):
+        if all(math.hypot(shift.east_m - k.east_m, shift.north_m - k.north_m) >= SAME_M for k in kept):
             kept.append(shift)
         if len(kept) == options.n_places:
             break

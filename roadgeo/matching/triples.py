@@ -21,12 +21,13 @@ from roadgeo._arrays import FloatArray, Int32Array, IntArray
 from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import count_alike, gather, look_up_each
-from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.index import IndexOptions, ReferenceIndex
+from roadgeo.matching.scene import MAX_INTERSECTIONS, MIN_COS, N_NEIGHBOURS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 
 __all__ = [
     "BEFORE_ROADS",
+    "MAX_ANCHORS",
     "WITHOUT_ROADS",
     "Proposals",
     "Sweep",
@@ -79,10 +80,10 @@ def cut_to_units(xy: FloatArray) -> IntArray:
 _MIN_SHAPE = 0.12
 #: Number of pairs of tangents that are looked up for an intersection with three or more tangents.
 _CODES_PER_VERTEX = 1
+#: Most intersections of the query that are looked up all over the frame, from its middle outwards.
+MAX_ANCHORS = 30
 #: Hits of a proposal may differ by this part of their affine maps' size.
 _AFFINE_TOLERANCE = 0.3
-#: Most intersections that are weighed as anchors, evenly chosen: weighing all would take longer than using some.
-_MAX_WEIGHED = 1000
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class TripleOptions:
         intersections. On a larger map the limits grow by the root of the ratio.
     """
 
-    n_neighbours: int = 8
+    n_neighbours: int = IndexOptions.n_neighbours
     angle_tolerance_deg: float = 8.0
     spread: bool = False
     max_hits: int = 12_000
@@ -173,7 +174,10 @@ def propose(
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     weighed = np.arange(len(query)) if among is None else among
-    weighed = np.ascontiguousarray(weighed[:: max(1, math.ceil(len(weighed) / _MAX_WEIGHED))])
+    weighed = np.ascontiguousarray(
+        weighed[:: max(1, math.ceil(len(weighed) / MAX_INTERSECTIONS))]
+        # weighing all takes longer than using some
+    )
     # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
@@ -245,16 +249,11 @@ class Sweep:
 
 
 #: If the rarest triples lead to no place, triples with more neighbours are used, all over the frame.
-_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True, angle_tolerance_deg=7.5)
-_SECOND = Sweep(_FURTHER, 30)
+_SECOND = Sweep(TripleOptions(n_neighbours=N_NEIGHBOURS, spread=True), MAX_ANCHORS)
 #: The sweeps if roads propose after them, when a few intersections with the rarest triples suffice; and the sweeps if
 #: roads propose nothing.
 BEFORE_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 12), _SECOND)
-WITHOUT_ROADS: tuple[Sweep, ...] = (
-    Sweep(TripleOptions(), 40),
-    _SECOND,
-    Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
-)
+WITHOUT_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 40), _SECOND)
 
 
 class _Room(threading.local):

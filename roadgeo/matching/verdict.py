@@ -23,7 +23,7 @@ from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.methods import N_PLACES, Searched
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
-from roadgeo.matching.scene import Query, Scene
+from roadgeo.matching.scene import NOTICEABLE, Query, Scene
 from roadgeo.matching.veto import broken_hints, without_hints
 
 __all__ = ["away", "decide", "georeference", "match_again", "searched_within"]
@@ -38,9 +38,6 @@ _LIKE_THE_TRUTH = 0.85
 #: A place is only half known if the standard deviation of its middle exceeds this share of the frame's side. The share
 #: is .0001 to .003 for located photographs; for frames almost without roads it was up to .09, and they lay 52 m off.
 _MOST_UNSURE = 0.03
-
-#: A similarity replaces the homography if it loses at most this share of the query's roads.
-_LEAST_LOST = 0.02
 
 
 def decide(query: Query, searched: Sequence[Searched], options: LocateOptions) -> Location:
@@ -426,4 +423,4 @@ def _level(place: Place) -> Place:
     # The covariance may be too large. Roads that agreed must still agree.
     refined = replace(place.refined, matrix=level.matrix, corner_covariance_m2=level.corner_covariance + level.by_tilt)
     levelled = place.at(refined)
-    return levelled if levelled.agreement.forward >= place.agreement.forward - _LEAST_LOST else place
+    return levelled if levelled.agreement.forward >= place.agreement.forward - NOTICEABLE else place

@@ -10,6 +10,7 @@ from worlds.scenes import Sight, camera, look, scene_of, soft
 from roadgeo.geometry.camera import pose
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import picture as pictures
+from roadgeo.matching.evidence import SHARES
 from roadgeo.matching.picture import Picture
 from roadgeo.matching.shifts import Shift, move_about, shifted
 
@@ -45,8 +46,8 @@ def naive_weigh(picture, matrix, usual_m=300.0):
     share = ground.roads.ravel()
     unit = cell_m / 2.0 / picture.statement_px  # roads are two cells wide, pixels are 1 m wide
     nats = []
-    for m in (0.05, 0.15, 0.3, 0.5, 0.75):
-        for f in (0.1, 0.3, 0.6, 1.0):
+    for m in SHARES:
+        for f in SHARES:
             on = np.log((1.0 - m) * road + m * other)
             off = np.log((1.0 - f * usual) * other + f * usual * road)
             nats.append(unit * (share * on + (1.0 - share) * off)[inside].sum())

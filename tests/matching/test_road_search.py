@@ -15,7 +15,6 @@ from roadgeo.matching.road_search import (
     COARSE_PIXEL_M,
     RADIUS_M,
     RING_STEP,
-    WIDE_RADIUS_M,
     RoadGrower,
     RoadSearch,
     Turnout,
@@ -146,7 +145,7 @@ def test_work_is_bounded(town, broken, monkeypatch):
         return len(list(roads.rounds()))
 
     assert n_anchors() == len(broken.intersections)
-    assert n_anchors(_MAX_ANCHORS=5) == 5
+    assert n_anchors(MAX_ANCHORS=5) == 5
     assert n_anchors(_MAX_TRIED=1, _LEAST_ANCHORS=3) == 3
 
 
@@ -186,7 +185,7 @@ def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
 def test_the_raster_is_made_once_and_has_a_rim(town):
     drawn = make_raster(town[1])
     assert make_raster(town[1]) is drawn
-    assert 64 * drawn.raster.cell > WIDE_RADIUS_M * 1.08
+    assert 64 * drawn.raster.cell > RADIUS_M * 1.08
     assert drawn.radii[-1] < 63
     cells = drawn.cells(town[1].xy)
     rows, columns = np.array(drawn.raster.tile_of.shape) * 64
@@ -226,7 +225,7 @@ def test_a_map_of_few_roads(broken):
 def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads(monkeypatch):
     monkeypatch.setattr(road_search, "_SCALE_SLACK", 1.0)
     camera = CameraOptions(gsd_m=(0.1, 12.0))
-    assert scales(camera, 0.0) == (0.1, 12.0)
+    assert scales(camera, math.nan) == (0.1, 12.0)
     assert scales(camera, 3.0) == (0.1, 12.0)
-    assert scales(camera, 10.0) == pytest.approx((0.2, 7.5))
+    assert scales(camera, 10.0) == pytest.approx((0.1, 7.5))
     assert scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
