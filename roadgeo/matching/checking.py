@@ -26,6 +26,7 @@ from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Whole
 from roadgeo.matching.place import Place
+from roadgeo.matching.refinement import TOLERANCE_M
 from roadgeo.matching.rivals import fitted
 from roadgeo.matching.scene import N_ROUGHLY, Query
 from roadgeo.matching.shifts import LocalSearchOptions, move_about, search_nearby
@@ -45,8 +46,6 @@ _MIN_CHI2 = 18.5
 _MIN_ROADS_M = 300.0
 #: By how much a given scale and tilt may be wrong: a factor, and degrees.
 _SCALED, _TILTED_DEG = 1.1, 5.0
-#: Least standard deviation of a corner, metres: corners of a similarity depend on each other.
-_LEAST_SIGMA_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,8 @@ def _displacement(given: Place, placed: Placement) -> Displacement:
     """Return how far a placement lies from the given place."""
     corners = Homography(placed.matrix).everywhere(Frame(*placed.size).corners)
     covariance = np.eye(8) if placed.corner_covariance_m2 is None else placed.corner_covariance_m2
-    return measure(given.corners, corners, covariance + _LEAST_SIGMA_M**2 * np.eye(8))
+    covariance = covariance + TOLERANCE_M**2 * np.eye(8)  # corners of a similarity depend on each other
+    return measure(given.corners, corners, covariance)
 
 
 def _agreeing(place: Place) -> float:

@@ -34,6 +34,7 @@ from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
 from roadgeo.matching.scene import AGREE_DEG, NOTICEABLE
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
+    N_RAREST,
     WITHOUT_ROADS,
     Proposals,
     Sweep,
@@ -57,14 +58,14 @@ _HARDLY = 0.5
 _LEADING = 2.0
 #: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
-#: Intersections of a place, those with the rarest tuples first, that are looked up elsewhere on the map before it is
-#: accepted; how; and the part of their neighbours there that an equal place has at least.
-_N_EQUALS, _OWN_TUPLES, _EQUAL = 12, TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
+#: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
+#: and the part of their neighbours there that an equal place has at least.
+_OWN_TUPLES, _EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
 #: by roads, and fitting a hypothesis to the map once, plus the time for each road point.
-_ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _BY_ROADS_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 0.1e-3
-_FITTED_S, _FITTED_POINT_S = 1e-3, 3.5e-6
+_STEP_S, _TUPLE_S, _PLACE_S, _GROWN_S, _BY_ROADS_S = 1e-3, 0.5e-6, 1.5e-6, 0.5e-3, 0.1e-3
+_FITTED_POINT_S = 3.5e-6
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ class TripleEstimator:
     @property
     def work(self) -> float:
         """Seconds that a usual machine takes for the work done (see `search.Estimator`), on one core."""
-        tried_s = _ROUND_S * self._n_rounds + _TUPLE_S * self.n_candidates + _PLACE_S * self.n_screened
+        tried_s = _STEP_S * self._n_rounds + _TUPLE_S * self.n_candidates + _PLACE_S * self.n_screened
         by_roads_s = (_BY_ROADS_S - _GROWN_S) * self._n_by_roads
         return tried_s + _GROWN_S * self.n_hypotheses + by_roads_s + self._fitted_s
 
@@ -282,7 +283,7 @@ class TripleEstimator:
         scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
         args = self.scene, [self.index], scale, camera.min_shape_ratio, _OWN_TUPLES
         anchors = propose(*args, self.sweeps.ahead, np.flatnonzero(there >= 0))
-        for (proposals,) in islice(anchors, _N_EQUALS):
+        for (proposals,) in islice(anchors, N_RAREST):
             is_own = proposals.reference == there[proposals.anchor]
             placed = _EQUAL * int(proposals.placed[is_own].max(initial=0))
             elsewhere = self.allow(proposals) & ~is_own & (proposals.placed >= placed)
@@ -389,7 +390,7 @@ class TripleEstimator:
             args = place.matrix, place.scene, place.index, place.matched
             refined = refine(*args, options, n_points, held=place.by_roads)
             n_all = len(place.scene.dense_points)
-            self._fitted_s += _FITTED_S + _FITTED_POINT_S * min(n_points or n_all, n_all)
+            self._fitted_s += _STEP_S + _FITTED_POINT_S * min(n_points or n_all, n_all)
             fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or fault is not None or self._is_far(refined.matrix):
                 return (place, True) if best >= 0.0 else (place.but(fault=fault, score=-math.inf), False)

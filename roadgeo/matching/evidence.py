@@ -30,8 +30,8 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import APART_M, MIN_COS, N_ROUGHLY, Scene, in_pixels
-from roadgeo.matching.shifts import shifted
+from roadgeo.matching.scene import APART_M, MIN_COS, N_CLOSELY, N_ROUGHLY, Scene, in_pixels
+from roadgeo.matching.shifts import SAME_M, shifted
 
 __all__ = ["SHARES", "Agreement", "Evidence", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
@@ -56,9 +56,9 @@ _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
 _HARDLY = 0.1
 #: Least step of the samples along the map's roads, which is at least a cell of the query's raster.
 STEP_M = 12.0
-#: Places nearby: evenly spread shifts of these lengths, and shifts that move one of a few map intersections near the
-#: middle to another intersection around it. The best are weighed.
-_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _WEIGHED = (30.0, 320.0), 150, 3, 6
+#: Places nearby: evenly spread shifts of up to this length, metres, and shifts that move one of a few map intersections
+#: near the middle to another intersection around it; `N_ROUGHLY` of each.
+_FARTHEST_M, _N_ANCHORS = 320.0, 3
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class Evidence:
         self,
         matrix: FloatArray,
         near: tuple[float, float, float] | None = None,
-        n_shifts: int = _N_SHIFTS,
+        n_shifts: int = N_ROUGHLY,
         n_anchors: int = _N_ANCHORS,
     ) -> float:
         """Return log10 L of the best shifted place.
@@ -254,17 +254,17 @@ class Evidence:
         shares_near_roads(
             matrix, points, directions, weights, reach_m, MIN_COS, shifts, self.index.road_buckets, shares
         )
-        best = np.argsort(-shares, kind="stable")[:_WEIGHED]
+        best = np.argsort(-shares, kind="stable")[:N_CLOSELY]
         return max((self.weigh(shifted(matrix, *shifts[k])) for k in best), default=0.0)
 
     def _least_shift(self, reach_m: float) -> float:
-        """Return the factor on `_SHIFT_M`: the shortest shift is three times the distance at which roads agree."""
-        return max(1.0, 4.5 * reach_m / _SHIFT_M[0])
+        """Return the factor on the lengths of shifts: the shortest is three times the distance at which roads agree."""
+        return max(1.0, 4.5 * reach_m / SAME_M)
 
     def _spiral(self, reach_m: float, n_shifts: int) -> FloatArray:
         """Return shifts (n_shifts, 2) in metres on a sunflower spiral."""
         k, wider = np.arange(n_shifts), self._least_shift(reach_m)
-        low, high = (wider * end for end in _SHIFT_M)
+        low, high = (wider * end for end in (SAME_M, _FARTHEST_M))
         radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / len(k))
         angle = k * math.pi * (3.0 - math.sqrt(5.0))
         return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
@@ -274,7 +274,7 @@ class Evidence:
     ) -> FloatArray:
         """Return shifts (M, 2), metres, that move a map intersection near the middle of the frame onto others."""
         wider = self._least_shift(reach_m)
-        low, high = (wider * end for end in _SHIFT_M)
+        low, high = (wider * end for end in (SAME_M, _FARTHEST_M))
         middle = Homography(matrix)(self.scene.center)
         near = self.index.within(middle, 2.0 * high)
         if not len(near):
@@ -286,7 +286,7 @@ class Evidence:
         if within is not None:
             possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
         shifts, length = shifts[possible], length[possible]
-        return np.asarray(shifts[np.argsort(length)[:_N_SHIFTS]])
+        return np.asarray(shifts[np.argsort(length)[:N_ROUGHLY]])
 
 
 def statement_px(gsd_m: float) -> float:

@@ -24,7 +24,7 @@ from roadgeo.matching.methods import N_PLACES, Searched, less_than
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import Rivals
-from roadgeo.matching.scene import Query, Scene
+from roadgeo.matching.scene import N_ROUGHLY, Query, Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.truth import TruthStory, finite_or_none, tell_truth, true_place
 from roadgeo.matching.verdict import decide
@@ -36,8 +36,8 @@ SCHEMA = "roadgeo.explanation/2"
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
-#: Most refused places that are compared, and most barred proposals of an anchor that are grown.
-_MAX_REFUSED, _MAX_ELSEWHERE = 200, 20
+#: Most barred proposals of an anchor that are grown; `N_ROUGHLY` refused places are compared.
+_MAX_ELSEWHERE = 20
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 #: Messages for stages without a result.
@@ -253,7 +253,7 @@ class _Course:
         refusals = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
         refused = [
             (fault, Place(scene, index, matrix / matrix[2, 2], by_roads=False))
-            for fault, matrix in islice(refusals, _MAX_REFUSED)
+            for fault, matrix in islice(refusals, N_ROUGHLY)
         ]
         refused.sort(key=lambda pair: -(pair[1].rate + pair[1].agreement.forward))
         settled = [(fault, free.settle(place)[0]) for fault, place in refused[:N_PLACES]]

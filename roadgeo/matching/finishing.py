@@ -17,7 +17,7 @@ from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import FEWEST
+from roadgeo.matching.lens import ENOUGH, FEWEST
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import (
     Equations,
@@ -31,8 +31,6 @@ from roadgeo.matching.scene import N_ROUGHLY, NOTICEABLE, Scene, at_least
 
 __all__ = ["measure_corners", "measured", "refine_beside", "with_honest_corners"]
 
-#: If this share of the mask's roads agrees, no cell of the frame was left out.
-_WHOLE = 0.9
 #: Corners are moved one by one by this distance, to see whether the fit comes back, metres in the middle of the frame;
 #: and the most rounds.
 _BESIDE_M, _MOST_ROUNDS = 24.0, 5
@@ -61,7 +59,7 @@ def measure_corners(estimator: TripleEstimator, best: Place) -> Place:
         return best
     scene = estimator.scene
     if best.lens_k1 == 0.0:
-        doubtful = best.agreement.forward < _WHOLE and best.score > 0.0
+        doubtful = best.agreement.forward < ENOUGH and best.score > 0.0
         if doubtful:
             best = _fit_whole_frame(estimator, best)
         best, scene = _fit_between_carriageways(estimator, best)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
 
 __all__ = [
+    "GSD_FACTOR",
     "HINTS",
     "STATED",
     "Hint",
@@ -40,7 +41,7 @@ Taken: TypeAlias = "int | tuple[float, float]"
 STATED = "exif"
 
 #: A single pixel size stands for the range from size / factor to size * factor: sizes are seldom known better.
-_GSD_FACTOR = 1.25
+GSD_FACTOR = 1.25
 #: Tolerance of a heading that is given without a tolerance, degrees.
 _HEADING_OFF_DEG = 10.0
 
@@ -134,7 +135,7 @@ def read_gsd(value: Any) -> tuple[float, float]:
         reach = low * share / 100 if off.endswith("%") else share
         return read_range((low - reach, high + reach), form)
     single = not isinstance(center, Sequence) or (isinstance(center, str) and not re.search("[,:]", center))
-    return (low / _GSD_FACTOR, low * _GSD_FACTOR) if single else (low, high)
+    return (low / GSD_FACTOR, low * GSD_FACTOR) if single else (low, high)
 
 
 def _read_heading(value: Any) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.structs import Held
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Equations, Refined, RefineOptions
-from roadgeo.matching.scene import NOTICEABLE, Scene, and_pixels
+from roadgeo.matching.scene import LEAST_SHARE, NOTICEABLE, Scene, and_pixels
 from roadgeo.roads.intersections import Intersections
 
 __all__ = [
@@ -38,8 +38,6 @@ FEWEST = 12
 _MAX_RADIUS = and_pixels(10.0)
 #: Starting values of k1, tried in turn until a fit explains enough.
 _STARTS = (0.0, -0.15, -0.08, 0.08)
-#: A fit that meets less than this share of the road points is dropped.
-_HOPELESS = 0.3
 
 
 def find_lens(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> Refined | None:
@@ -107,7 +105,7 @@ def fit_lens(
     held = Held(points, places, 0.5 * equations.weight * len(core) / len(some))
     none = equations.pairs(points[:0], places[:0], 0.0)
     fitted = equations.adjust(none, held)
-    return None if fitted is None or fitted.share < max(_HOPELESS, FEWEST / len(equations.samples.xy)) else fitted
+    return None if fitted is None or fitted.share < max(LEAST_SHARE, FEWEST / len(equations.samples.xy)) else fitted
 
 
 def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArray:

@@ -40,7 +40,7 @@ __all__ = [
 _MAX_TUPLES = 30_000_000
 #: Tangents of the reference begin so far from the intersection (see `IntersectionOptions`), and are sampled every
 #: `_STEP_M`. Roads further off than `_REACH_M`, or turned from the branch by more, are other roads.
-_SKIP_M, _STEP_M, _REACH_M = 8.0, 3.0, 6.0
+_SKIP_M, _STEP_M, _REACH_M = IntersectionOptions.skip_length, 3.0, 6.0
 
 
 @dataclass(frozen=True)

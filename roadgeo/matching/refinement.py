@@ -20,6 +20,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import APART_M, MIN_COS, N_ROUGHLY, NOTICEABLE, Scene, and_pixels, at_least
 
 __all__ = [
+    "TOLERANCE_M",
     "Equations",
     "RefineOptions",
     "Refined",
@@ -49,7 +50,7 @@ _USUAL_RMS = 0.7
 #: alone would not determine a homography, and the start would be forgotten.
 _HELD_M, _FEW_MATCHES = 5.0, 8
 #: Iterations, which end where nothing moves by more, metres.
-_N_ITERATIONS, _TOLERANCE_M = 15, 0.02
+_N_ITERATIONS, TOLERANCE_M = 15, 0.02
 #: Accuracy of the map, metres, and of the mask, pixels, as a whole, which no number of points improves: lines are drawn
 #: and thinned to whole pixels. Fitted to the corners of training masks.
 _SIGMA_FLOOR = (0.1, 0.15)
@@ -174,7 +175,7 @@ class Equations:
         self._plane = Plane(self.unit, *self._origin.tolist())
         self._limits = AdjustLimits(
             _N_CELLS**2, options.least_share, options.max_radius[0] + options.max_radius[1] * gsd,
-            MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, _TOLERANCE_M,
+            MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, TOLERANCE_M,
         )  # fmt: skip
         n = len(xy)
         self.met = Met(np.empty((n, free)), np.full(n, np.nan), np.ones(n), np.empty(n), np.empty(n, np.bool_))

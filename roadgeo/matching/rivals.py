@@ -32,7 +32,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture, by_picture
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.refinement import refine
-from roadgeo.matching.scene import N_ROUGHLY, at_least
+from roadgeo.matching.scene import N_CLOSELY, N_ROUGHLY, at_least
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import SAME_M, Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
@@ -56,8 +56,6 @@ _MAY_LEAD = 0.5
 _PENALTY = 60.0
 #: Number of the likeliest places met by the search that are compared, and most times that one turns out to be better.
 N_LIKELIEST = 12
-#: Number of the likeliest places around that are fully refined.
-_N_FITTED = 8
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
@@ -65,10 +63,8 @@ _APART, _SAME = 0.04, 0.67
 #: are not independent; where they favour different places, it counts against.
 #: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
-#: The likeliest of the picture's places around that are weighed.
-_WEIGHED = 4
 #: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
-_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=_N_FITTED)
+_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
 _AROUND = replace(_NEARBY, reach_m=4000.0, n_places=40)
 
 
@@ -293,7 +289,7 @@ def _around(picture: Picture, best: Place, reach_m: float, apart_m: float, estim
         reach_m = min(reach_m, 2.0 * estimator.near[2])
     peaks = picture.correlate(best.matrix, reach_m, _TURNS_DEG, N_LIKELIEST, apart_m)
     allowed = (place for place in peaks if estimator.may_be(place.matrix))
-    return [picture.settle(place) for place in islice(allowed, _WEIGHED)]
+    return [picture.settle(place) for place in islice(allowed, N_CLOSELY)]
 
 
 def similar_places(
@@ -316,8 +312,8 @@ def similar_places(
     starts = (Place(scene, index, matrix) for _, matrix in proposed[: around.n_places])
     fits = (fitted(start, match, N_ROUGHLY) for start in starts)
     roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
-    finely = (fitted(other.place, match, None) for other in roughly[:_N_FITTED])
-    return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[_N_FITTED:]]
+    finely = (fitted(other.place, match, None) for other in roughly[:N_CLOSELY])
+    return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[N_CLOSELY:]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:

@@ -31,7 +31,16 @@ from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, denormalise
-from roadgeo.matching.scene import AGREE_DEG, LARGE_PIXEL_M, MIN_COS, Scene, and_pixels
+from roadgeo.matching.scene import (
+    AGREE_DEG,
+    LARGE_PIXEL_M,
+    LEAST_SHARE,
+    MIN_COS,
+    N_ROUGHLY,
+    ROAD_TURN,
+    Scene,
+    and_pixels,
+)
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import MAX_ANCHORS, farthest_first, larger
 from roadgeo.roads.intersections import unpack_branches
@@ -53,9 +62,8 @@ __all__ = [
 ]
 
 
-#: Ratio of a ring around an intersection to the next; how far directions may differ from a road's and belong to it, and
-#: how far branches that agree may be apart.
-RING_STEP, _TURN = 1.08, math.radians(20.0)
+#: Ratio of a ring around an intersection to the next.
+RING_STEP = 1.08
 #: Side of a raster's cells; how far from a road the middles of its cells lie, for at 200 m from an intersection half a
 #: step of scale moves a road by 8 m; and where the rings around intersections end, less than 63 cells away. Metres; a
 #: coarse map multiplies all lengths by its coarseness.
@@ -144,7 +152,7 @@ def _draw(index: ReferenceIndex) -> RoadRaster:
     x0, y0 = float(low[0]), float(low[1])
     n = mark_tiles(segments, x0, y0, cell, reach, tile_of)
     bits = np.zeros((n + 1, TILE, TILE), np.uint16)
-    paint_roads(segments, x0, y0, cell, reach, _TURN, tile_of, bits)
+    paint_roads(segments, x0, y0, cell, reach, ROAD_TURN, tile_of, bits)
     raster = Raster(tile_of, bits, cell)
     density = np.empty((rows, columns), np.float32)
     measure_tiles(raster, density)
@@ -164,8 +172,8 @@ _SCALE_STEPS = np.array([0.96, 1.04])
 _OWN_M = 150.0
 #: A scale at which fewer points are in reach is not tried.
 _LEAST_POINTS = 15
-#: Number of the best proposals that are judged anew, and number of road points that judge them, as far as rings reach.
-_KEPT, _WIDE_POINTS = 400, 160
+#: Number of the best proposals that are judged anew.
+_KEPT = 400
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
 #: around intersections.
 _TRIAL = VoteRates(0.55, 1.5)
@@ -241,7 +249,7 @@ class Voter:
         turn, max_off = -round(self.heading[0] * _PER_RADIAN), round(self.heading[1] * _PER_RADIAN)
         found = np.empty((_KEPT, 4))
         kept, tried = vote(
-            self.candidates, rays, round(_TURN * _PER_RADIAN), turn, max_off, self.scales, points,
+            self.candidates, rays, round(ROAD_TURN * _PER_RADIAN), turn, max_off, self.scales, points,
             _LEAST_POINTS, self.places, found,
         )  # fmt: skip
         wide = self._wide(around)
@@ -259,7 +267,7 @@ class Voter:
         order = near[np.argsort(away[near], kind="stable")]
         offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
         angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
-        radial = np.abs((offsets * directions).sum(axis=1)) > math.cos(_TURN) * away
+        radial = np.abs((offsets * directions).sum(axis=1)) > math.cos(ROAD_TURN) * away
         return _Around(offsets, away, angles, radial)
 
     def _mark(self, around: _Around) -> AnyArray:
@@ -274,7 +282,7 @@ class Voter:
     def _wide(self, around: _Around) -> RoadPoints:
         """Choose the points that judge proposals anew at each scale, evenly by distance."""
         usable = np.searchsorted(around.away, RADIUS_M * self.index.coarseness / self.scales)
-        n = np.minimum(usable, _WIDE_POINTS)
+        n = np.minimum(usable, N_ROUGHLY)
         starts = np.concatenate(([0], np.cumsum(n)))
         scale = np.repeat(np.arange(len(n)), n)
         taken = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
@@ -288,17 +296,14 @@ def _whole(angles: AnyArray) -> IntArray:
     return whole.clip(-WHOLE_TURN // 2, WHOLE_TURN // 2 - 1)
 
 
-#: Road points used, and the part of half the frame's diagonal up to which an affine map will do.
-_MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
-#: A proposal is given up if a smaller share of the points around it lies on roads. Wrong proposals end at 0.3 to 0.4;
-#: right ones at 0.5 and more, on masks with 40 % of the roads gone and 40 % false.
-_LEAST_SHARE = 0.3
+#: The part of half the frame's diagonal up to which an affine map will do.
+_AFFINE_UNTIL = 0.45
 #: Points within the sum of metres and pixels of a road lie on it.
 _TOLERANCE_M, _TOLERANCE_PX = and_pixels(7.0)
-#: Proposals of an intersection that are kept after each of the first stages because they are closest to roads, and
-#: those kept for most votes. With all 40 kept, 396 intersections led to the place of a broken mask; now 395 do, in half
-#: the time. In lattices 255 of 266 do, in a quarter.
-_GO_ON, _SURE = (16, 6, 3), 2
+#: Proposals of an intersection that are kept after each of the first stages because they are closest to roads, besides
+#: `_MAX_KEPT` with most votes. With all 40 kept, 396 intersections led to the place of a broken mask; now 395 do, in
+#: half the time. In lattices 255 of 266 do, in a quarter.
+_GO_ON = (16, 6, 3)
 
 
 class RoadGrower:
@@ -307,9 +312,7 @@ class RoadGrower:
     def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions) -> None:
         self.scene, self.index = scene, index
         perspective = camera.perspective_sigma(RefineOptions.perspective_sigma)
-        self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, _GO_ON, _SURE)
-        thin = max(1, len(scene.dense_points) // _MAX_POINTS)
-        self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
+        self._stages = Stages(_AFFINE_UNTIL, LEAST_SHARE, perspective, MIN_COS, _GO_ON, _MAX_KEPT)
 
     def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Place]:
         """Grow proposals of query intersection `anchor`; return those that were not given up, in their order.
@@ -320,9 +323,9 @@ class RoadGrower:
         """
         half_size = self.scene.half_size
         at = self.scene.intersections.xy[anchor]
-        away = self.points - at
+        away = self.scene.points - at
         outwards = np.argsort(np.hypot(*away.T), kind="stable")
-        points, directions = away[outwards] / half_size, self.directions[outwards]
+        points, directions = away[outwards] / half_size, self.scene.directions[outwards]
         j00, j01, j10, j11 = np.asarray(affines, float).T
         gsd = np.sqrt(j00 * j11 - j01 * j10)
         zero = np.zeros_like(gsd)
@@ -348,8 +351,6 @@ COARSE_PIXEL_M = 0.35
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
 #: Number of an anchor's proposals that grow, and number of grown places that are compared with the map.
 _MAX_GROWN, _MAX_KEPT = 80, 2
-#: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
-_SCALE_SLACK = 1.2
 #: Greatest width of roads, metres: no scales are tried at which they would be wider.
 _ROAD_WIDTH_M = 75.0
 
@@ -360,7 +361,6 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
     Small pixels show more than a coarse map.
     """
     low, high = camera.gsd_m
-    low, high = low / _SCALE_SLACK, high * _SCALE_SLACK
     if coarseness != 1.0:
         low = max(low, coarseness * COARSE_PIXEL_M)
     high = max(high, low)

@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import N_ROUGHLY, Scene
+from roadgeo.matching.scene import N_ROUGHLY, ROAD_TURN, Scene
 
 __all__ = [
     "Drawn",
@@ -34,8 +34,6 @@ __all__ = [
 Drawn: TypeAlias = dict[tuple[float, ...], tuple[AnyArray, FloatArray]]
 
 _DIRECTIONS = 16
-#: Directions within this angle of a road's run along it.
-_ALONG = math.radians(18.0)
 
 
 #: A place nearer than this to a better place, metres, is the same place.
@@ -147,7 +145,7 @@ def _draw_layers(index: ReferenceIndex, center: FloatArray, reach_m: float) -> t
     layers = np.zeros((_DIRECTIONS, side, side), np.uint8)
     for d, layer in enumerate(layers):
         away = np.abs((d + 0.5) * math.pi / _DIRECTIONS - angle)
-        chosen = lines[np.minimum(away, math.pi - away) <= _ALONG]
+        chosen = lines[np.minimum(away, math.pi - away) <= ROAD_TURN]
         cv2.polylines(layer, list(chosen), False, 1, max(1, round(_ROAD_M / cell)), cv2.LINE_8, 4)
     return layers, origin
 

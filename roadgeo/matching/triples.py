@@ -28,6 +28,7 @@ from roadgeo.matching.search import ALONE, Ahead
 __all__ = [
     "BEFORE_ROADS",
     "MAX_ANCHORS",
+    "N_RAREST",
     "WITHOUT_ROADS",
     "Proposals",
     "Sweep",
@@ -80,8 +81,8 @@ def cut_to_units(xy: FloatArray) -> IntArray:
 _MIN_SHAPE = 0.12
 #: Number of pairs of tangents that are looked up for an intersection with three or more tangents.
 _CODES_PER_VERTEX = 1
-#: Most intersections of the query that are looked up all over the frame, from its middle outwards.
-MAX_ANCHORS = 30
+#: Most intersections of the query that are looked up all over the frame, and of those with the rarest triples.
+MAX_ANCHORS, N_RAREST = 30, 12
 #: Hits of a proposal may differ by this part of their affine maps' size.
 _AFFINE_TOLERANCE = 0.3
 
@@ -252,8 +253,8 @@ class Sweep:
 _SECOND = Sweep(TripleOptions(n_neighbours=N_NEIGHBOURS, spread=True), MAX_ANCHORS)
 #: The sweeps if roads propose after them, when a few intersections with the rarest triples suffice; and the sweeps if
 #: roads propose nothing.
-BEFORE_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 12), _SECOND)
-WITHOUT_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 40), _SECOND)
+BEFORE_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), N_RAREST), _SECOND)
+WITHOUT_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), MAX_ANCHORS), _SECOND)
 
 
 class _Room(threading.local):

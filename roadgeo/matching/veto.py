@@ -16,6 +16,7 @@ from roadgeo.geometry.areas import lies_in
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.projection import metres_apart
 from roadgeo.matching.evidence import Evidence
+from roadgeo.matching.hints import GSD_FACTOR
 from roadgeo.matching.methods import Searched, may_show, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Part
@@ -24,8 +25,8 @@ from roadgeo.matching.scene import Query
 
 __all__ = ["broken_hints", "contest", "without_hints"]
 
-#: A place at the hinted one is another place if it is turned by more, or larger or smaller by this factor.
-_TURNED_DEG, _SCALED = 45.0, 1.25
+#: A place at the hinted one is another place if it is turned by more, or of a size that a hint tells from it.
+_TURNED_DEG = 45.0
 #: Another place explains more if its log10 likelihood is greater by this. Where streets repeat, places are equal but
 #: for the accuracy of tracing, and it is a hint that separates them: a true one must not lose to the roads' noise.
 _MORE = 0.5
@@ -93,7 +94,7 @@ def _is_other(hinted: Place, place: Place) -> bool:
     """Return whether a place is another than the hinted one: elsewhere, turned, or of another size."""
     turn = hinted.view.rotation_deg - place.view.rotation_deg
     is_turned = abs((turn + 180.0) % 360.0 - 180.0) > _TURNED_DEG
-    return is_turned or abs(math.log(place.gsd_m / hinted.gsd_m)) > math.log(_SCALED) or not place.same(hinted)
+    return is_turned or abs(math.log(place.gsd_m / hinted.gsd_m)) > math.log(GSD_FACTOR) or not place.same(hinted)
 
 
 def broken_hints(place: Place, options: LocateOptions) -> list[str]:

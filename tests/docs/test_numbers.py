@@ -102,7 +102,7 @@ FROM_CODE = [
     (
         "docs/commands/locate.md",
         r"([\d.]+) alone stands for ([\d.]+) to ([\d.]+)\.",
-        (0.3, 0.3 / hints._GSD_FACTOR, 0.3 * hints._GSD_FACTOR),
+        (0.3, 0.3 / hints.GSD_FACTOR, 0.3 * hints.GSD_FACTOR),
     ),
     ("docs/commands/locate.md", r"scale is known to (\d+) %", round(100 * (queries._SCALED - 1))),
     ("docs/commands/locate.md", r"may be off \(default (\d+)\)", hints._HEADING_OFF_DEG),
@@ -225,7 +225,11 @@ FROM_CODE = [
     ("docs/how-well.md", r"\| ([\d.]+) to 5 \|", NEEDED),
     ("docs/how-well.md", r"middle lies within (\d+) m, or", RADIUS_M),
     ("docs/paper.md", r"are fitted at (\d+) to (\d+) m", (TANGENT.skip_length, TANGENT.tangent_length)),
-    ("docs/paper.md", r"([\d.]+) to ([\d.]+) road widths in a mask", (scene._SKIP, scene._TANGENT)),
+    (
+        "docs/paper.md",
+        r"([\d.]+) to ([\d.]+) road widths in a mask",
+        (scene._SKIP, scene._TANGENT),
+    ),
     ("docs/paper.md", r"a line with the weight ([\d.]+):", intersections._STIFFNESS),
     ("docs/paper.md", r"On the map only, from (\d+) m on", pairs._SKIP_M),
     ("docs/paper.md", r"At most ([\d,]+) intersections of a mask", scene.MAX_INTERSECTIONS),

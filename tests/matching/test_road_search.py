@@ -73,7 +73,7 @@ def test_limits_on_scale_and_turn_are_kept(town, broken, up):
 
 
 def test_on_a_coarse_map_small_pixels_are_not_looked_for():
-    assert scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0) == (6.0 * COARSE_PIXEL_M, 12.0 * 1.2)
+    assert scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0) == (6.0 * COARSE_PIXEL_M, 12.0)
     assert scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0, 6.0)[0] > 0.5
 
 
@@ -222,8 +222,7 @@ def test_a_map_of_few_roads(broken):
     assert result.score < 2.5
 
 
-def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads(monkeypatch):
-    monkeypatch.setattr(road_search, "_SCALE_SLACK", 1.0)
+def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads():
     camera = CameraOptions(gsd_m=(0.1, 12.0))
     assert scales(camera, math.nan) == (0.1, 12.0)
     assert scales(camera, 3.0) == (0.1, 12.0)

@@ -76,7 +76,7 @@ class TestPrepareScene:
         assert scene.half_size == pytest.approx(np.hypot(100, 50))
         assert scene.road_length_px == pytest.approx(300)
         assert scene.n_edges == 2
-        assert len(scene.points) == 50
+        assert len(scene.points) == 100
         assert scene.neighbours.shape == (0, 12)
 
     def test_field_is_the_distance_to_the_nearest_road(self):
