@@ -31,7 +31,7 @@ from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scen
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
-from roadgeo.matching.scene import AGREE_DEG, NOTICEABLE
+from roadgeo.matching.scene import AGREE_DEG, LEAST_SHARE, NOTICEABLE
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
     N_RAREST,
@@ -45,19 +45,17 @@ from roadgeo.matching.triples import (
     propose,
 )
 
-__all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
+__all__ = ["HARDLY", "Ledger", "MatchOptions", "TripleEstimator"]
 
 #: Stop refining a place below this log10 likelihood, or, after the first two refinements, below this part of
 #: the best place's: 276 of 277 right places led every other place by a fifth after the first.
 _LEAST_LIKELY, _BEHIND = 0.7, 0.8
 #: A place that explains less than this part of the best place is not refined again after the first refinement. A place
 #: that grew by roads is not refined at all if it explains less as grown: the least of 71 right places explained 0.9.
-_HARDLY = 0.5
+HARDLY = 0.5
 #: A place that leads all earlier places by this score is compared with places nearby; if it leads these too, a lens is
 #: tried. The weakest of ten right places with a lens, or fitted to a part only, led by 3.2.
 _LEADING = 2.0
-#: `RefineOptions.least_share` for places that grew by roads: false roads abound there.
-_LEAST_SHARE_BY_ROADS = 0.2
 #: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
 #: and the part of their neighbours there that an equal place has at least.
 _OWN_TUPLES, _EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
@@ -318,10 +316,10 @@ class TripleEstimator:
     def _verify(self, place: Place) -> Place:
         """Refine a place with more and more points, as long as it may be the best place, or its rival."""
         best = max((other.log10_likelihood for other in self.verified), default=0.0)
-        if place.by_roads and 0.0 < _HARDLY * best > place.log10_likelihood:
+        if place.by_roads and 0.0 < HARDLY * best > place.log10_likelihood:
             return self._scored(place)
         for n_points, least in ((150, _BEHIND * best), (300, _BEHIND * best), (None, 0.0)):
-            place, converged = self._converge(place, n_points, _HARDLY * best)
+            place, converged = self._converge(place, n_points, HARDLY * best)
             if not converged:
                 return place
             if place.log10_likelihood < max(_LEAST_LIKELY, least):
@@ -405,9 +403,9 @@ class TripleEstimator:
         return place, True
 
     def refinement(self, place: Place) -> RefineOptions:
-        """Return the options for refining a place."""
+        """Return the options for refining a place: false roads abound where places grow by roads."""
         usual = self.refine_options
-        return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if place.by_roads and self.options.roads else usual
+        return replace(usual, least_share=LEAST_SHARE) if place.by_roads and self.options.roads else usual
 
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""

@@ -23,7 +23,7 @@ from roadgeo.matching.growing import SharedSweeps
 from roadgeo.matching.methods import N_PLACES, Searched, less_than
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
-from roadgeo.matching.rivals import Rivals
+from roadgeo.matching.rivals import N_LIKELIEST, Rivals
 from roadgeo.matching.scene import N_ROUGHLY, Query, Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.truth import TruthStory, finite_or_none, tell_truth, true_place
@@ -36,8 +36,6 @@ SCHEMA = "roadgeo.explanation/2"
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
-#: Most barred proposals of an anchor that are grown; `N_ROUGHLY` refused places are compared.
-_MAX_ELSEWHERE = 20
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 #: Messages for stages without a result.
@@ -231,14 +229,15 @@ class _Course:
             [fault for fault, _ in self.events.of("refused")] + [place.fault for place in settled if place.fault]
         )
         listed = [*searched.compared, *searched.places[1:]]
-        others = [less_than(listed[0], place) if listed else place for place in settled]
+        met = (place for place in settled if not any(place.same(other) for other in listed))
+        others = [less_than(listed[0], place) if listed else place for place in met]
         entries = [*listed, *others, *([] if location.located else self._without_limits())]
         self.places = tuple(map(self._tell, self._distinct(sorted(entries, key=self._rank))))
 
     def _look_elsewhere(self) -> None:
         """Grow some proposals that the hints bar, to report that they would fit."""
         for proposals, allowed, _ in self.events.of("screened"):
-            barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
+            barred = proposals.only(np.flatnonzero(~allowed)[:N_LIKELIEST])
             for place in self.estimator.grow(barred, np.arange(len(barred.reference)))[:N_PLACES]:
                 fault = self.estimator.judge(place.matrix, rough=True)
                 if fault is not None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from roadgeo.geometry.areas import Box, find_area, is_box
+from roadgeo.matching.search import SearchOptions
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
@@ -282,7 +283,7 @@ _TABLE = (
         "time_limit", "time_limit_s", "SECONDS", "Time limit, seconds",
         "Stop searching for an image then. The paper's matcher stops after 10 by itself.",
         lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
-        _ABOVE_0, 60, "The search",
+        _ABOVE_0, round(SearchOptions.time_limit_s), "The search",
     ),
 )  # fmt: skip
 

@@ -31,7 +31,7 @@ _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 #: Cells along each side of the frame; the part of the best cell's share of road points on roads that cells need where a
 #: fit begins; and about the number of points there that are held at first.
 _CORE, _N_HELD = (10, 0.75), 50
-#: Road points that a fit needs.
+#: Road points that a fit needs, and a scale at which roads vote.
 FEWEST = 12
 #: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the
 #: frame that meets wrong roads bends the whole fit.

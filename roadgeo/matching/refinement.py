@@ -17,7 +17,7 @@ from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import AdjustLimits, Held, Met, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import APART_M, MIN_COS, N_ROUGHLY, NOTICEABLE, Scene, and_pixels, at_least
+from roadgeo.matching.scene import APART_M, LEAST_SHARE, MIN_COS, N_ROUGHLY, NOTICEABLE, Scene, and_pixels, at_least
 
 __all__ = [
     "TOLERANCE_M",
@@ -38,9 +38,8 @@ __all__ = [
 #: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
 #: Cauchy weights.
 _SIGMA_M, _SIGMA_PX = 1.2, 0.9
-#: Weight of a matched intersection relative to an independent road point, for its centre is less certain. A match takes
-#: part if at least this share of its neighbours are matched.
-_INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
+#: Weight of a matched intersection relative to an independent road point, for its centre is less certain.
+_INTERSECTION_WEIGHT = 0.3
 #: Cells of the frame a side.
 _N_CELLS = 8
 #: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
@@ -291,7 +290,7 @@ def refine(
     chosen = matched >= 0
     around = scene.neighbours[chosen]
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
-    chosen[chosen] = support >= _LEAST_SUPPORT
+    chosen[chosen] = support >= LEAST_SHARE
     pairs = equations.pairs(scene.intersections.xy[chosen], index.xy[matched[chosen]], _INTERSECTION_WEIGHT)
     grid = _grid(6 if held or len(pairs.query) < _FEW_MATCHES else 0)
     weight = 8.0 / 36.0 * (equations.sigma_m / at_least(_HELD_M, equations.gsd)) ** 2

@@ -26,7 +26,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import CameraFault, judge
-from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import HARDLY, MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture, by_picture
@@ -46,7 +46,7 @@ _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 #: A place is not compared further if it leads all places nearby by this score, nothing contradicts it, and the best
 #: place nearby explains less than this part of it: streets do not repeat there. Four of 274 mirrored masks led by it,
 #: where a city is like its mirror image: they were contradicted by 8.7 and more.
-_CERTAIN, _REPEATING = 12.0, 0.5
+_CERTAIN = 12.0
 #: Streets around are searched if the lead over the places met is at least this part of the lead needed. At wrong places
 #: that part is up to a tenth, at right places nine tenths and more.
 _MAY_LEAD = 0.5
@@ -64,7 +64,7 @@ _APART, _SAME = 0.04, 0.67
 #: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
 #: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
-_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
+_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0)
 _AROUND = replace(_NEARBY, reach_m=4000.0, n_places=40)
 
 
@@ -220,7 +220,7 @@ class Rivals:
         penalty, own = _penalty(best), best.log10_likelihood
         likeliest = next((other.log10_likelihood for other in ranked if not other.same(best)), 0.0)
         lead = min(best.score, own - max(likeliest, 0.0))
-        if lead >= _CERTAIN and not penalty and max(likeliest, estimator.nearby(best)) < _REPEATING * own:
+        if lead >= _CERTAIN and not penalty and max(likeliest, estimator.nearby(best)) < HARDLY * own:
             return best.but(score=lead - penalty, rival=None)
         if time.perf_counter() > self._deadline:
             return best.but(score=min(lead, 0.0), rival=None)
@@ -248,7 +248,7 @@ class Rivals:
         rivals = list(filter(is_rival, met))
         compared = scored(rivals)
         leads = compared.score >= _MAY_LEAD * self.needed
-        if not leads and estimator.nearby(best) < _REPEATING * own:
+        if not leads and estimator.nearby(best) < HARDLY * own:
             return compared
         for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(best, compare, estimator.options, around))

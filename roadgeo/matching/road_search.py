@@ -13,7 +13,7 @@ while they are in use.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -29,6 +29,7 @@ from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, me
 from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
 from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.lens import FEWEST
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, denormalise
 from roadgeo.matching.scene import (
@@ -170,8 +171,6 @@ _SCALE_STEPS = np.array([0.96, 1.04])
 #: Roads nearer than this, metres, that run straight away from the intersection are left out: they are its own branches,
 #: which agree by construction. The right place then stands out more.
 _OWN_M = 150.0
-#: A scale at which fewer points are in reach is not tried.
-_LEAST_POINTS = 15
 #: Number of the best proposals that are judged anew.
 _KEPT = 400
 #: Share of road points that meet roads at the right place; and by chance, in units of the density of roads, which crowd
@@ -250,7 +249,7 @@ class Voter:
         found = np.empty((_KEPT, 4))
         kept, tried = vote(
             self.candidates, rays, round(ROAD_TURN * _PER_RADIAN), turn, max_off, self.scales, points,
-            _LEAST_POINTS, self.places, found,
+            FEWEST, self.places, found,
         )  # fmt: skip
         wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, _TRIAL)
@@ -376,14 +375,14 @@ class Turnout:
     ----------
     n_map : int
         Intersections of all parts.
-    n_tried : int
-        Places and turns tried on them until now.
+    tried : Counter
+        Places and turns tried on them until now, by intersection.
     last : int or None
         The final number, once it is known.
     """
 
     n_map: int
-    n_tried: int = 0
+    tried: Counter[int] = field(default_factory=Counter)
     last: int | None = None
     _asked: set[int] = field(default_factory=set, init=False)
 
@@ -391,7 +390,7 @@ class Turnout:
         """Return whether the n-th intersection (from 0) votes; the first part to reach it decides for all."""
         if self.last is None and n not in self._asked:
             self._asked.add(n)
-            if n >= _LEAST_ANCHORS and self.n_tried >= _MAX_TRIED * larger(self.n_map):
+            if n >= _LEAST_ANCHORS and self.tried.total() >= _MAX_TRIED * larger(self.n_map):
                 self.last = n
         return self.last is None or n < self.last
 
@@ -440,7 +439,7 @@ class RoadSearch:
         for n, votes in enumerate(self.ahead.map(self.voter.votes, anchors)):
             if not self.turnout.includes(n):
                 return
-            self.turnout.n_tried += votes.n_tried
+            self.turnout.tried[votes.anchor] += votes.n_tried
             best = slice(_MAX_GROWN)
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
             some = sorted(grown, key=lambda place: -place.support)

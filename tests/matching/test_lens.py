@@ -168,7 +168,7 @@ def test_where_most_of_a_frame_is_astray_and_hardly_a_road_is_left_the_claim_sta
 def test_a_place_that_is_grown_anew_behind_a_lens_is_told_as_grown_once(town):
     """It grew before it was dropped: else more would be said to survive than was proposed."""
 
-    _, elsewhere = sight_of(random_network(77), 5, sight=Sight(0.6))
+    _, elsewhere = sight_of(random_network(72), 5, sight=Sight(0.6))
     events = Events(kept=True)
     search(estimator_of(elsewhere, town[1], events=events))
     grew = [id(matrix) for grown in events.of("grown") for matrix in grown]
