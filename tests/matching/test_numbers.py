@@ -215,7 +215,7 @@ def test_a_place_is_half_known_where_its_middle_is_uncertain_by_3_hundredths_of_
 
 
 @pytest.mark.parametrize(("lost", "is_level"), [(0.015, True), (0.03, False)])
-def test_a_camera_looks_straight_down_where_that_loses_2_hundredths_of_the_roads(monkeypatch, lost, is_level):
+def test_a_camera_looks_straight_down_where_that_loses_hardly_a_road(monkeypatch, lost, is_level):
     level = SimpleNamespace(matrix=np.eye(3), corner_covariance=np.eye(8), by_tilt=0.0)
     monkeypatch.setattr(verdict, "find_similarity", lambda *_: level)
     place, levelled = (SimpleNamespace(agreement=SimpleNamespace(forward=forward)) for forward in (0.9, 0.9 - lost))
