@@ -45,7 +45,7 @@ class Ledger:
     n_reference : int
         Intersections of all parts: attempts are bounded as on one map of that size.
     tried : Counter
-        The places, by what proposed them: "triples" or "roads".
+        The places, by their source: "triples" or "roads".
     """
 
     n_reference: int

@@ -142,7 +142,7 @@ def _read(setting: str, value: str, usual: Any) -> Any:
             raise ValueError(f"{setting!r}, expected {' or '.join(texts)}")
         return texts[value]
     low = usual / _WIDEST
-    high = 1.0 - low if usual < 1.0 else usual * _WIDEST  # what is usually below 1 stays below
+    high = 1.0 - low if usual < 1.0 else usual * _WIDEST  # a number usually below 1 stays below
     try:
         number = type(usual)(value)
     except ValueError:

@@ -48,7 +48,7 @@ __all__ = [
 
 
 #: Most intersections, the nearest to the middle of the frame, which locate a mask as well and bound time and memory;
-#: most of them for what takes long for each; and most neighbours of each.
+#: most of them where each takes long; and most neighbours of each.
 _MAX_INTERSECTIONS, MAX_INTERSECTIONS, N_NEIGHBOURS = 5000, 1000, 12
 #: Road points by which many places are compared roughly, and number of the best of these that are looked at closely.
 N_ROUGHLY, N_CLOSELY = 200, 6
