@@ -75,8 +75,8 @@ ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
         ErrorRate(8.0, 189, 1, 0.0291),
         ErrorRate(15.0, 2359, 0, 0.00156),
     ),
-    "soft mask": (ErrorRate(3.5, 10, 1, 0.445), ErrorRate(8.0, 51, 0, 0.0698), ErrorRate(15.0, 135, 0, 0.027)),
-    "hints": (ErrorRate(3.5, 19, 1, 0.26), ErrorRate(15.0, 112, 0, 0.0324)),
+    "soft mask": (ErrorRate(3.5, 11, 1, 0.413), ErrorRate(8.0, 59, 0, 0.0606), ErrorRate(15.0, 163, 0, 0.0224)),
+    "hints": (ErrorRate(3.5, 24, 1, 0.211), ErrorRate(15.0, 147, 0, 0.0248)),
     "photograph": (ErrorRate(3.5, 32, 0, 0.109),),
 }
 

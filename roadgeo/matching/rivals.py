@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -64,8 +63,8 @@ _APART, _SAME = 0.04, 0.67
 #: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
 #: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
-_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0)
-_AROUND = replace(_NEARBY, reach_m=4000.0, n_places=40)
+_NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
+_AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0)
 
 
 class Compared(NamedTuple):

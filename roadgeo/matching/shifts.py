@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import N_CLOSELY, N_ROUGHLY, ROAD_TURN, Scene
+from roadgeo.matching.scene import N_ROUGHLY, ROAD_TURN, Scene
 
 __all__ = [
     "Drawn",
@@ -59,7 +59,7 @@ class LocalSearchOptions:
 
     reach_m: float = 350.0
     turn_deg: float = 6.0
-    n_places: int = N_CLOSELY
+    n_places: int = 40
 
 
 @dataclass(frozen=True)

@@ -289,7 +289,7 @@ def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_
     """A block beside may be the place, whether or not the best one that was met leads."""
     looked = []
     monkeypatch.setattr(rivals, "_CERTAIN", certain)
-    monkeypatch.setattr(rivals, "_REPEATING", 0.0)
+    monkeypatch.setattr(rivals, "HARDLY", 0.0)
     monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[3:]) or [])
     monkeypatch.setattr(TripleEstimator, "look_for_equals", lambda *_: None)
     stand(even, even[0], beside(even[0], even[2]))
