@@ -106,7 +106,7 @@ def test_a_page_does_what_it_says(page: str, desk: Path, request: pytest.Fixture
     if page == DEMO:  # run once for all
         assert not documents.missing_files(PAGES[page], request.getfixturevalue("demonstrated").parent)
         return
-    if "roadgeo_demo" in PAGES[page] and "\nroadgeo demo\n" not in PAGES[page]:
+    if re.search("roadgeo_demo|`roadgeo demo", PAGES[page]) and "\nroadgeo demo\n" not in PAGES[page]:
         shutil.copytree(request.getfixturevalue("demonstrated"), desk / "roadgeo_demo")
     left_out = {block.line for block in blocks(PAGES[page]) if block.text.startswith(ELSEWHERE)}
     with fake_osm() as osm:
