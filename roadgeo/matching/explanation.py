@@ -24,7 +24,7 @@ from roadgeo.matching.methods import N_PLACES, Searched, less_than
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place
 from roadgeo.matching.rivals import N_LIKELIEST, Rivals
-from roadgeo.matching.scene import N_ROUGHLY, Query, Scene
+from roadgeo.matching.scene import Query, Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.truth import TruthStory, finite_or_none, tell_truth, true_place
 from roadgeo.matching.verdict import decide
@@ -36,6 +36,8 @@ SCHEMA = "roadgeo.explanation/2"
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
+#: Most refused places that are compared.
+_MAX_REFUSED = 200
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 #: Messages for stages without a result.
@@ -252,7 +254,7 @@ class _Course:
         refusals = (refusal for refusal in self.events.of("refused") if refusal[0] in _NEGOTIABLE)
         refused = [
             (fault, Place(scene, index, matrix / matrix[2, 2], by_roads=False))
-            for fault, matrix in islice(refusals, N_ROUGHLY)
+            for fault, matrix in islice(refusals, _MAX_REFUSED)
         ]
         refused.sort(key=lambda pair: -(pair[1].rate + pair[1].agreement.forward))
         settled = [(fault, free.settle(place)[0]) for fault, place in refused[:N_PLACES]]

@@ -17,7 +17,7 @@ from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import ENOUGH, FEWEST
+from roadgeo.matching.lens import ENOUGH
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import (
     Equations,
@@ -27,7 +27,7 @@ from roadgeo.matching.refinement import (
     refine_between,
     weight_on_roads,
 )
-from roadgeo.matching.scene import N_ROUGHLY, NOTICEABLE, Scene, at_least
+from roadgeo.matching.scene import FEWEST, N_ROUGHLY, NOTICEABLE, Scene, at_least
 
 __all__ = ["measure_corners", "measured", "refine_beside", "with_honest_corners"]
 

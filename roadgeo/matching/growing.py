@@ -18,7 +18,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions
 from roadgeo.matching.road_search import Turnout
-from roadgeo.matching.scene import MAX_INTERSECTIONS, MIN_COS, Scene, and_pixels
+from roadgeo.matching.scene import MAX_COSTLY, MIN_COS, Scene, and_pixels
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import Proposals, Sweep
 
@@ -83,7 +83,7 @@ def grow_proposals(
         return []
     # The query: intersections outwards from the anchor, and the neighbours on which each proposal is based.
     xy, anchor = scene.intersections.xy, proposals.anchor
-    order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[:MAX_INTERSECTIONS]  # the nearest to the anchor
+    order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[:MAX_COSTLY]  # the nearest to the anchor
     partners = np.ascontiguousarray(proposals.partners[chosen])
     neighbours = np.ascontiguousarray(scene.neighbours[:, : partners.shape[1]])
     matched = np.empty((len(chosen), len(xy)), np.int64)

@@ -12,12 +12,11 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.structs import Held
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Equations, Refined, RefineOptions
-from roadgeo.matching.scene import LEAST_SHARE, NOTICEABLE, Scene, and_pixels
+from roadgeo.matching.scene import FEWEST, LEAST_SHARE, NOTICEABLE, Scene, and_pixels
 from roadgeo.roads.intersections import Intersections
 
 __all__ = [
     "ENOUGH",
-    "FEWEST",
     "find_lens",
     "fit_lens",
     "grow_whole",
@@ -31,8 +30,6 @@ _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
 #: Cells along each side of the frame; the part of the best cell's share of road points on roads that cells need where a
 #: fit begins; and about the number of points there that are held at first.
 _CORE, _N_HELD = (10, 0.75), 50
-#: Road points that a fit needs, and a scale at which roads vote.
-FEWEST = 12
 #: `RefineOptions.max_radius` while a fit grows. At twice the radius every point meets some road, and a part of the
 #: frame that meets wrong roads bends the whole fit.
 _MAX_RADIUS = and_pixels(10.0)

@@ -39,7 +39,7 @@ from roadgeo.matching.pairs import (
     type_keys,
 )
 from roadgeo.matching.refinement import denormalise, normalise
-from roadgeo.matching.scene import MAX_INTERSECTIONS
+from roadgeo.matching.scene import MAX_COSTLY
 from roadgeo.matching.search import SearchOptions
 from roadgeo.roads.intersections import Intersections
 
@@ -291,8 +291,8 @@ class _Search:
         """Draw l query tuples with their types, those rare in the reference first, at random within a type."""
         options, rng, tuples = self.options, self.rng, self.index.tuples
         chosen = np.arange(len(self.query))
-        if len(chosen) > MAX_INTERSECTIONS:  # all of them still judge hypotheses
-            chosen = rng.choice(chosen, MAX_INTERSECTIONS, replace=False)
+        if len(chosen) > MAX_COSTLY:  # all of them still judge hypotheses
+            chosen = rng.choice(chosen, MAX_COSTLY, replace=False)
         pairs = list_pairs(self.query, chosen, np.inf, options.delta_angle_deg)
         keys = type_keys(self.codes, pairs)
         order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -64,7 +65,7 @@ _APART, _SAME = 0.04, 0.67
 _AGREEING = 0.5
 #: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
 _NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
-_AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0)
+_AROUND = replace(_NEARBY, reach_m=4000.0, n_places=LocalSearchOptions.n_places)
 
 
 class Compared(NamedTuple):

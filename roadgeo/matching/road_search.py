@@ -13,7 +13,7 @@ while they are in use.
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -29,11 +29,11 @@ from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, me
 from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
 from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, VoteRates, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import FEWEST
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, denormalise
 from roadgeo.matching.scene import (
     AGREE_DEG,
+    FEWEST,
     LARGE_PIXEL_M,
     LEAST_SHARE,
     MIN_COS,
@@ -375,22 +375,22 @@ class Turnout:
     ----------
     n_map : int
         Intersections of all parts.
-    tried : Counter
-        Places and turns tried on them until now, by intersection.
+    n_tried : int
+        Places and turns tried on them until now.
     last : int or None
         The final number, once it is known.
     """
 
     n_map: int
-    tried: Counter[int] = field(default_factory=Counter)
+    n_tried: int = 0
     last: int | None = None
-    _asked: set[int] = field(default_factory=set, init=False)
+    _asked: int = field(default=0, init=False)
 
     def includes(self, n: int) -> bool:
         """Return whether the n-th intersection (from 0) votes; the first part to reach it decides for all."""
-        if self.last is None and n not in self._asked:
-            self._asked.add(n)
-            if n >= _LEAST_ANCHORS and self.tried.total() >= _MAX_TRIED * larger(self.n_map):
+        if self.last is None and n >= self._asked:
+            self._asked = n + 1
+            if n >= _LEAST_ANCHORS and self.n_tried >= _MAX_TRIED * larger(self.n_map):
                 self.last = n
         return self.last is None or n < self.last
 
@@ -439,7 +439,7 @@ class RoadSearch:
         for n, votes in enumerate(self.ahead.map(self.voter.votes, anchors)):
             if not self.turnout.includes(n):
                 return
-            self.turnout.tried[votes.anchor] += votes.n_tried
+            self.turnout.n_tried += votes.n_tried
             best = slice(_MAX_GROWN)
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
             some = sorted(grown, key=lambda place: -place.support)

@@ -25,9 +25,10 @@ from roadgeo.roads.vectorization import vectorize
 __all__ = [
     "AGREE_DEG",
     "APART_M",
+    "FEWEST",
     "LARGE_PIXEL_M",
     "LEAST_SHARE",
-    "MAX_INTERSECTIONS",
+    "MAX_COSTLY",
     "MIN_COS",
     "NOTICEABLE",
     "N_CLOSELY",
@@ -49,7 +50,7 @@ __all__ = [
 
 #: Most intersections, the nearest to the middle of the frame, which locate a mask as well and bound time and memory;
 #: most of them where each takes long; and most neighbours of each.
-_MAX_INTERSECTIONS, MAX_INTERSECTIONS, N_NEIGHBOURS = 5000, 1000, 12
+_MAX_INTERSECTIONS, MAX_COSTLY, N_NEIGHBOURS = 5000, 1000, 12
 #: Road points by which many places are compared roughly, and number of the best of these that are looked at closely.
 N_ROUGHLY, N_CLOSELY = 200, 6
 #: Roads nearer than this to each other, metres, err alike.
@@ -60,6 +61,8 @@ NOTICEABLE, LEAST_SHARE = 0.025, 0.3
 #: Most points along the roads, and their least spacing, pixels: a few for quick comparisons, more for an intersection's
 #: surroundings.
 _N_POINTS, _N_DENSE, _SPACING_PX = 600, 6000, 3.0
+#: Road points that a fit needs, and a scale at which roads vote.
+FEWEST = 12
 #: Cells of the reduced frame along its longer side.
 _FIELD_CELLS = 400
 #: Greatest difference of the directions of roads, or branches, that agree, degrees, and its cosine: a proposal may turn

@@ -22,7 +22,7 @@ from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import count_alike, gather, look_up_each
 from roadgeo.matching.index import IndexOptions, ReferenceIndex
-from roadgeo.matching.scene import MAX_INTERSECTIONS, MIN_COS, N_NEIGHBOURS, Scene
+from roadgeo.matching.scene import MAX_COSTLY, MIN_COS, N_NEIGHBOURS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 
 __all__ = [
@@ -175,10 +175,8 @@ def propose(
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     weighed = np.arange(len(query)) if among is None else among
-    weighed = np.ascontiguousarray(
-        weighed[:: max(1, math.ceil(len(weighed) / MAX_INTERSECTIONS))]
-        # weighing all takes longer than using some
-    )
+    # Weighing all takes longer than using some.
+    weighed = np.ascontiguousarray(weighed[:: max(1, math.ceil(len(weighed) / MAX_COSTLY))])
     # the number of table entries to compare with each pair of an anchor's neighbours
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)

@@ -232,7 +232,7 @@ FROM_CODE = [
     ),
     ("docs/paper.md", r"a line with the weight ([\d.]+):", intersections._STIFFNESS),
     ("docs/paper.md", r"On the map only, from (\d+) m on", pairs._SKIP_M),
-    ("docs/paper.md", r"At most ([\d,]+) intersections of a mask", scene.MAX_INTERSECTIONS),
+    ("docs/paper.md", r"At most ([\d,]+) intersections of a mask", scene.MAX_COSTLY),
     ("docs/paper.md", r"first `n_px` = (\d+) pixels", PAIR.n_px),
     ("docs/paper.md", r"average error ([\d.]+) pixels", PAIR.fit_error_px),
     ("docs/paper.md", r"The center moves (\d+) m at most", TANGENT.max_shift),

@@ -446,7 +446,7 @@ def test_the_answer_does_not_depend_on_the_load(reference, index, monkeypatch):
 
 
 def test_large_queries_form_tuples_of_a_sample(reference, index, monkeypatch):
-    monkeypatch.setattr(paper, "MAX_INTERSECTIONS", 40)
+    monkeypatch.setattr(paper, "MAX_COSTLY", 40)
     rng = np.random.default_rng(14)
     truth = camera(rng, (2000, 2000), gsd=2.5)
     query, _ = view(reference, truth, rng)
