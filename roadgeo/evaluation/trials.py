@@ -19,6 +19,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.projection import to_plane
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.opening import open_reference
+from roadgeo.running.pool import Lost
 from roadgeo.running.processes import run
 from roadgeo.storage.files import write_text, writing
 from roadgeo.workflows import LocateOptions, locate
@@ -240,10 +241,10 @@ class _Trying:
 
         return attempt
 
-    def give_up(self, task: int, reason: str) -> Trial:
+    def give_up(self, task: int, lost: Lost) -> Trial:
         """Count a query whose process died as not located."""
         truth, _ = self.queries.open()(task)
-        return Trial(truth, {"status": "not_located", "reason": reason})
+        return Trial(truth, {"status": "not_located", "reason": lost.said})
 
 
 # --- the record -------------------------------------------------------------------------------------------------------

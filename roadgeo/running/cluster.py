@@ -64,7 +64,7 @@ class Cluster:
             Dask is not installed; there is no scheduler at the address, or it went away.
         """
         with self.connected() as client:
-            yield from DaskWorkers(client, work).run(tasks, work)
+            yield from DaskWorkers(client, work).run(tasks)
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[Any]:
@@ -121,7 +121,7 @@ class DaskWorkers(Pool):
 
     def __init__(self, client: Any, work: Any) -> None:
         """Take them as Dask's client knows them."""
-        self._client, self._made = client, Made.of(work)
+        self.work, self._client, self._made = work, client, Made.of(work)
 
     def names(self) -> list[str]:
         """Return their addresses, in order; at least one."""
@@ -150,10 +150,6 @@ class DaskWorkers(Pool):
             return Lost("died", "the workers that it was given to died, one after another")
         except (CancelledError, OSError) as error:
             raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
-
-    def close(self) -> None:
-        """Call off what is under way."""
-        self._client.close()
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------

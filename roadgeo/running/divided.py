@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
@@ -98,7 +97,7 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
     sizes = {name: _size(part) for name, part in able.items()}
     with cluster.connected() as client, Ahead(_AHEAD) as ahead:
         workers = DaskWorkers(client, _Map(locating.references))
-        locate = partial(_locate, workers.do, workers.names, sizes)
+        locate = partial(_locate, workers.run, workers.names, sizes)
         yield from ahead.map(lambda task: locating.do(task, asked, locate), tasks)
 
 
@@ -120,7 +119,7 @@ def _size(part: Part) -> int:
 
 
 def _locate(
-    do: Callable[[_Parts], _PartAnswer | Lost],
+    run: Callable[[Sequence[_Parts]], Iterator[_PartAnswer]],
     workers: Callable[[], Sequence[str]],
     sizes: Mapping[str, int],
     mask: RoadMask,
@@ -145,8 +144,7 @@ def _locate(
             share = larger(sum(sizes.values())) / larger(sum(sizes[name] for name in names))
             against = 2.0 * math.log10(share)  # as in `Rivals`, for the whole map
             asked.append(_Parts(worker, query, names, options, against))
-        with ThreadPoolExecutor(len(asked)) as threads:
-            return [_answer_of(answer, query) for answer in threads.map(do, asked)]
+        return list(run(asked))
 
     all_parts = owners(list(sizes), here)
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
@@ -160,13 +158,6 @@ def _locate(
     # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
     chosen = list(dict.fromkeys(part for _, part in places)) or best.parts
     return search({next(iter(owners(chosen[:1], here))): chosen}, options)[0].location
-
-
-def _answer_of(answer: _PartAnswer | Lost, query: Query) -> _PartAnswer:
-    """Refuse to answer without a part of the map."""
-    if isinstance(answer, Lost):
-        raise RoadgeoError(f"{query.name}: a part of the map has no answer: {answer.said}")
-    return answer
 
 
 def _rank(answer: _PartAnswer) -> tuple[bool, float]:
@@ -197,6 +188,10 @@ class _Map:
     def prepare(self) -> _Searcher:
         """Open the references, none of their shards."""
         return _Searcher(_parts_of(open_references(self.references)))
+
+    def give_up(self, task: _Parts, lost: Lost) -> _PartAnswer:
+        """Refuse to answer without a part of the map."""
+        raise RoadgeoError(f"{task.query.name}: a part of the map has no answer: {lost.said}")
 
 
 @dataclass(frozen=True)

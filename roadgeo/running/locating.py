@@ -21,6 +21,7 @@ from roadgeo.errors import MaskError, Reason, RoadgeoError, is_of_memory, name_p
 from roadgeo.geometry.frame import Frame
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
+from roadgeo.running.pool import Lost
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.tasks import Task
 from roadgeo.storage.fence import remedy
@@ -93,9 +94,9 @@ class Locating:
         references = open_references(self.references)
         return Question(references, perf_counter() - started, self._changes())
 
-    def give_up(self, task: Task, reason: str) -> Outcome:
+    def give_up(self, task: Task, lost: Lost) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
-        return self.failed(task, Reason.FAULT, reason)
+        return self.failed(task, Reason.FAULT, lost.said)
 
     def failed(self, task: Task, code: Reason, reason: str) -> Outcome:
         """Describe a failure with the keys of every other result."""

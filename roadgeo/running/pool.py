@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -22,9 +23,7 @@ from roadgeo.storage.fence import Fence, is_started_inside
 
 __all__ = ["Lost", "Pool", "Work", "enter"]
 
-Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
-Result = TypeVar("Result")
 ResultOut = TypeVar("ResultOut", covariant=True)
 
 #: Results for each worker that may wait until those before them are there.
@@ -37,7 +36,7 @@ class Work(Protocol[TaskIn, ResultOut]):
     def prepare(self) -> Callable[[TaskIn], ResultOut]:
         """Make a process ready (open the references) and return the function that does one task."""
 
-    def give_up(self, task: TaskIn, reason: str) -> ResultOut:
+    def give_up(self, task: TaskIn, lost: Lost) -> ResultOut:
         """Make the result of a task that is lost."""
 
 
@@ -58,7 +57,14 @@ class Lost:
 
 
 class Pool(ABC):
-    """Workers that do tasks; may be asked from several threads."""
+    """Workers that are ready for one kind of work; may be asked from several threads.
+
+    Attributes
+    ----------
+    work : Work
+    """
+
+    work: Any
 
     @abstractmethod
     def busy(self) -> int:
@@ -68,65 +74,47 @@ class Pool(ABC):
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
         """Have one do a task, and return its result, or why it is lost; raises what the task raised."""
 
-    @abstractmethod
-    def close(self) -> None:
-        """End all that they do."""
-
-    def do(
+    def run(
         self,
-        task: Any,
+        tasks: Sequence[Any],
         patience_s: float = math.inf,
         say: Say = say_nothing,
         called_off: threading.Event | None = None,
-    ) -> Any:
-        """Do one task as soon as a worker is free, twice where the first one died, and return its result, or `Lost`.
+    ) -> Iterator[Any]:
+        """Do all tasks and yield their results in order, each as soon as it and those before it are there.
+
+        Once nobody reads any more no task begins; what is under way goes on until the workers are ended.
 
         Parameters
         ----------
         patience_s : float
-            Time for it; a worker that takes longer is ended.
+            Time for each task; a worker that takes longer is ended.
         say
             Called with the progress.
         called_off : Event, optional
-            Once it is set nobody waits for the result any more.
+            Once it is set nobody waits for the results any more.
         """
-        asked = task, patience_s, say, called_off or threading.Event()
-        result = self.ask(*asked)
-        return self.ask(*asked) if _died(result) else result
-
-    def run(self, tasks: Sequence[Task], work: Work[Task, Result]) -> Iterator[Result]:
-        """Do all tasks and yield their results in order, each as soon as it and those before it are there.
-
-        Who stops reading ends the workers.
-        """
-        waiting, begun, once = iter(tasks), deque[Future[Any]](), (math.inf, say_nothing, threading.Event())
+        waiting, begun = iter(tasks), deque[Future[Any]]()
+        ask = partial(self.ask, patience_s=patience_s, say=say, called_off=called_off or threading.Event())
         threads = ThreadPoolExecutor(len(tasks) or 1, "roadgeo-pool")  # which starts no more than are busy
-
-        def begin() -> list[Future[Any]]:
-            busy, under_way = self.busy(), [future for future in begun if not future.done()]
-            room = min(busy - len(under_way), _UNREAD * busy - len(begun))
-            more = [threads.submit(self.ask, task, *once) for task in islice(waiting, max(room, 0))]
-            begun.extend(more)
-            return under_way + more
 
         try:
             for task in tasks:
-                under_way = begin()
-                while not begun[0].done():
-                    wait(under_way, return_when=FIRST_COMPLETED)
-                    under_way = begin()
+                while True:
+                    busy, under_way = self.busy(), [future for future in begun if not future.done()]
+                    room = min(busy - len(under_way), _UNREAD * busy - len(begun))
+                    more = [threads.submit(ask, each) for each in islice(waiting, max(room, 0))]
+                    begun.extend(more)
+                    if begun[0].done():
+                        break
+                    wait(under_way + more, return_when=FIRST_COMPLETED)
                 result = begun.popleft().result()
-                if _died(result):
-                    wait(under_way)
-                    result = self.ask(task, *once)
-                yield work.give_up(task, result.said) if isinstance(result, Lost) else result
+                if isinstance(result, Lost) and result.why == "died":
+                    wait(begun)
+                    result = ask(task)
+                yield self.work.give_up(task, result) if isinstance(result, Lost) else result
         finally:
-            self.close()
-            threads.shutdown(cancel_futures=True)
-
-
-def _died(result: Any) -> bool:
-    return isinstance(result, Lost) and result.why == "died"
+            threads.shutdown(wait=False, cancel_futures=True)
 
 
 # --- in a worker ------------------------------------------------------------------------------------------------------

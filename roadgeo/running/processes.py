@@ -54,7 +54,8 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
         yield from map(work.prepare(), tasks) if tasks else ()
         return
     _require_guard()
-    yield from Processes(work, min(jobs, len(tasks))).run(tasks, work)
+    with contextlib.closing(Processes(work, min(jobs, len(tasks)))) as processes:
+        yield from processes.run(tasks)
 
 
 def _require_guard() -> None:
@@ -97,7 +98,7 @@ class Processes(Pool):
         within : Fence, optional
             A fence that they enter; by default this process's own.
         """
-        self._grace_s, self._closed, self._lock = grace_s, False, threading.Lock()
+        self.work, self._grace_s, self._closed, self._lock = work, grace_s, False, threading.Lock()
         self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
         self.all = [_Process((work, clean, within or fence.current())) for _ in range(count)]
         for process in self.all:

@@ -38,6 +38,7 @@ from roadgeo.reference.shards import (
 from roadgeo.reference.spool import Bounds, Spool
 from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.network import build_network
+from roadgeo.running.pool import Lost
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines, add_counts
 from roadgeo.sources.overpass import box_area
@@ -313,9 +314,9 @@ class ShardWork:
         spool, crs = Spool(Path(self.work) / "lines", stored["size"]), str(stored["crs"])
         return lambda box: self._build(box, spool, crs)
 
-    def give_up(self, task: ShardBox, reason: str) -> str:
+    def give_up(self, task: ShardBox, lost: Lost) -> str:
         """Report that a shard could not be built."""
-        return f"shard {task.name}: {reason}"
+        return f"shard {task.name}: {lost.said}"
 
     def _build(self, box: ShardBox, spool: Spool, crs: str) -> ShardEntry:
         done = Path(self.folder) / f"{box.name}.json"

@@ -26,6 +26,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.options import ReadOptions
+from roadgeo.running.pool import Lost
 from roadgeo.running.queries import locate_query
 from roadgeo.running.tasks import Task
 from roadgeo.running.variants import Variant
@@ -73,9 +74,9 @@ class VerifyRun:
         warm_up()
         return lambda task: verify_image(task.mask, references, self)
 
-    def give_up(self, task: Task, reason: str) -> Verified:
+    def give_up(self, task: Task, lost: Lost) -> Verified:
         """Make the outcome of an image that could not be worked on."""
-        return _failed(task.mask, reason)
+        return _failed(task.mask, lost.said)
 
 
 def verify_image(image: str, references: Sequence[AnyReference], settings: VerifyRun | None = None) -> Verified:

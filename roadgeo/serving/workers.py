@@ -148,14 +148,10 @@ class ImageWorkers:
         """
         patience_s = request.time_limit_s + (_PATIENT_S if request.keeps else _GRACE_S)
         try:
-            reply: Reply | Lost = self._processes.do(request, patience_s, say, called_off)
+            replies: list[Reply] = list(self._processes.run([request], patience_s, say, called_off))
         except RoadgeoError as error:  # a process that was started anew cannot open the references any more
             return Reply(503, {"detail": str(error)})
-        if not isinstance(reply, Lost):
-            return reply
-        _LOG.warning("no answer: %s", reply.said)
-        status, sentence = _LOST[reply.why]
-        return Reply(status, {"detail": sentence.format(reply.said)})
+        return replies[0]
 
     def close(self) -> None:
         """End all processes."""
@@ -184,6 +180,12 @@ class Serving:
         with suppress(ModelError):  # masks are located without it
             load_model("", None, self.threads)
         return lambda request: _reply(request, references, tell if request.keeps else say_nothing, self.threads)
+
+    def give_up(self, task: ImageRequest, lost: Lost) -> Reply:  # noqa: ARG002 (it says the same of each)
+        """Tell why there is no answer."""
+        _LOG.warning("no answer: %s", lost.said)
+        status, sentence = _LOST[lost.why]
+        return Reply(status, {"detail": sentence.format(lost.said)})
 
 
 def _reply(request: ImageRequest, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Reply:

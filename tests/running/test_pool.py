@@ -12,7 +12,7 @@ from roadgeo.errors import RoadgeoError
 from roadgeo.running.pool import Lost, Pool
 from roadgeo.running.processes import Processes, tell
 
-GIVE_UP = SimpleNamespace(give_up=lambda task, reason: f"{task}: {reason}")
+GIVE_UP = SimpleNamespace(give_up=lambda task, lost: f"{task}: {lost.said}")
 
 
 @dataclass
@@ -27,10 +27,12 @@ class Toys(Pool):
     inside: int = 0
     goes_on: threading.Event = field(default_factory=threading.Event)
 
+    work = GIVE_UP
+
     def busy(self) -> int:
         return self.count
 
-    def ask(self, task, *_):
+    def ask(self, task, **_):
         self.begun.append(task)
         self.inside += 1
         self.beside[task] = self.inside
@@ -45,13 +47,10 @@ class Toys(Pool):
         finally:
             self.inside -= 1
 
-    def close(self) -> None:
-        self.goes_on.set()
-
 
 def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
     toys = Toys(4, {3: 1, 7: 2})
-    found = list(toys.run(range(20), GIVE_UP))
+    found = list(toys.run(range(20)))
     assert [result for k, result in enumerate(found) if k != 7] == [k for k in range(20) if k != 7]
     assert found[7] == "7: they died"
     assert (toys.begun.count(3), toys.begun.count(7)) == (2, 2)
@@ -60,7 +59,7 @@ def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
 
 def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
     toys = Toys(2, slow=0)
-    results = toys.run(range(200), GIVE_UP)
+    results = toys.run(range(200))
     reader = threading.Timer(0.5, toys.goes_on.set)
     reader.start()
     assert next(results) == 0
@@ -68,12 +67,12 @@ def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
     assert list(results) == list(range(1, 200))
 
 
-def test_what_a_task_raises_is_raised_and_ends_the_workers() -> None:
+def test_what_a_task_raises_is_raised_and_no_other_begins() -> None:
     toys = Toys()
-    toys.ask = lambda *_: 1 / 0
+    toys.ask = lambda task, **_: toys.begun.append(task) or 1 / 0
     with pytest.raises(ZeroDivisionError):
-        list(toys.run(range(3), GIVE_UP))
-    assert toys.goes_on.is_set()
+        list(toys.run(range(200)))
+    assert len(toys.begun) <= 32
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,9 @@ class Tasks:
             raise _OddError("one", two=2)
         return os.getpid()
 
+    def give_up(self, task: str, lost: Lost) -> Lost:
+        return lost
+
 
 class _OddError(Exception):
     """Cannot be sent to another process."""
@@ -113,33 +115,38 @@ def pool():
     processes.close()
 
 
+def done(pool: Pool, task: str, *how: object, **more: object) -> object:
+    (result,) = pool.run([task], *how, **more)
+    return result
+
+
 def test_progress_is_passed_on_and_errors_are_raised(pool: Pool) -> None:
     messages: list[object] = []
-    process = pool.do("tell", say=lambda *said: messages.append(said))
+    process = done(pool, "tell", say=lambda *said: messages.append(said))
     assert messages == [("half", 0.5)]
     with pytest.raises(RoadgeoError, match="no road"):
-        pool.do("fail")
+        done(pool, "fail")
     with pytest.raises(RuntimeError, match="_OddError"):
-        pool.do("odd")
-    assert pool.do("") == process
+        done(pool, "odd")
+    assert done(pool, "") == process
 
 
 def test_what_takes_too_long_or_is_called_off_is_ended(pool: Pool) -> None:
-    before = pool.do("")
-    assert pool.do("wait", 0.2) == Lost("late", "longer than 0.2 s")
-    assert pool.do("") != before
+    before = done(pool, "")
+    assert done(pool, "wait", 0.2) == Lost("late", "longer than 0.2 s")
+    assert done(pool, "") != before
     called_off = threading.Event()
     threading.Timer(0.3, called_off.set).start()
-    assert pool.do("wait", called_off=called_off).why == "called off"
-    before = pool.do("")
-    assert pool.do("wait", called_off=called_off).why == "called off"
-    assert pool.do("") == before  # nobody had begun
+    assert done(pool, "wait", called_off=called_off).why == "called off"
+    before = done(pool, "")
+    assert done(pool, "wait", called_off=called_off).why == "called off"
+    assert done(pool, "") == before  # nobody had begun
 
 
 def test_processes_that_cannot_prepare_say_why() -> None:
     processes = Processes(Tasks(prepares=False), 1, grace_s=0.0)
     for _ in range(2):
         with pytest.raises(RoadgeoError, match="no map"):
-            processes.do("")
+            done(processes, "")
     processes.close()
-    assert processes.do("").why == "no worker"
+    assert done(processes, "").why == "no worker"

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from support.groups import is_gone
 
+from roadgeo.running.pool import Lost
 from roadgeo.running.processes import run
 
 
@@ -28,8 +29,8 @@ class Shout:
         time.sleep(0.05 if task == "a" else 0)
         return task.upper()
 
-    def give_up(self, task: str, reason: str) -> str:
-        return f"{task}: {reason}"
+    def give_up(self, task: str, lost: Lost) -> str:
+        return f"{task}: {lost.said}"
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -67,7 +68,7 @@ class Slow:
             time.sleep(0 if task == 'a' else 60)
         finally:
             open(task, 'w').close()
-    def give_up(self, task, reason): pass
+    def give_up(self, task, lost): pass
 if __name__ == '__main__':
     for _ in run(list('abcdef'), Slow(), 3): print('one', flush=True)
 """

@@ -19,8 +19,8 @@ class Squares:
     def prepare(self):
         return self._square
 
-    def give_up(self, task, reason):
-        return f"{task}: {reason}"
+    def give_up(self, task, lost):
+        return f"{task}: {lost.said}"
 
     def _square(self, task):
         with (Path(self.folder) / f"{task}.txt").open("a") as file:
