@@ -11,20 +11,21 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import socket
 import threading
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
 from roadgeo.running.pool import Lost, Pool, Work, enter
 from roadgeo.running.processes import without_interrupts
 from roadgeo.storage.fence import Fence, current
-from roadgeo.storage.folders import private_temporary_dir
 
 __all__ = ["Cluster", "DaskWorkers"]
 
@@ -36,6 +37,15 @@ _AHEAD = 2
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
+
+#: Of a cluster on this machine. Its scheduler serves its status at any port, for one may be taken.
+_SETTINGS = {"distributed.worker.multiprocessing-method": "spawn", "distributed.logging.distributed": "error"}
+_LOCAL: dict[str, Any] = {
+    "threads_per_worker": 1,
+    "scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+    "memory_limit": 0,
+    "silence_logs": 50,
+}
 
 
 @dataclass(frozen=True)
@@ -63,12 +73,12 @@ class Cluster:
         RoadgeoError
             Dask is not installed; there is no scheduler at the address, or it went away.
         """
-        with self.connected() as client:
-            yield from DaskWorkers(client, work).run(tasks)
+        with self.connected(work) as workers:
+            yield from workers.run(tasks)
 
     @contextlib.contextmanager
-    def connected(self) -> Iterator[Any]:
-        """Connect to the scheduler, or start one; return Dask's client.
+    def connected(self, work: Any) -> Iterator[DaskWorkers]:
+        """Connect to the scheduler, or start one; return its workers, for one kind of work.
 
         Raises
         ------
@@ -76,12 +86,17 @@ class Cluster:
             Dask is not installed; there is no scheduler at the address.
         """
         try:
-            from distributed import Client
+            import dask
+            from distributed import Client, LocalCluster
         except ImportError as error:
             raise RoadgeoError(f"a cluster needs dask: {how_to_install('dask')}") from error
 
         with contextlib.ExitStack() as stack:
-            address = self.scheduler or stack.enter_context(_local_cluster(self.workers))
+            address = self.scheduler
+            if address is None:
+                stack.enter_context(dask.config.set(_SETTINGS))
+                with without_interrupts():
+                    address = stack.enter_context(LocalCluster(n_workers=self.workers, **_LOCAL))
             try:
                 client = stack.enter_context(Client(address, timeout=_PATIENCE_S))
                 client.wait_for_workers(1, timeout=_PATIENCE_S)
@@ -91,29 +106,7 @@ class Cluster:
                     f"no Dask scheduler with workers at {address}: {what}; "
                     "start them with `dask scheduler`, `dask worker`"
                 ) from error
-            yield client
-
-
-@contextlib.contextmanager
-def _local_cluster(workers: int) -> Iterator[Any]:
-    """Start worker processes on this machine, for as long as they are needed."""
-    import dask
-    from distributed import LocalCluster
-
-    settings = {"distributed.worker.multiprocessing-method": "spawn", "distributed.logging.distributed": "error"}
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(settings))
-        with without_interrupts():
-            cluster = LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},  # any port: one may be taken
-                memory_limit=0,
-                silence_logs=50,
-            )
-            stack.enter_context(cluster)
-        yield cluster
+            yield DaskWorkers(client, work)
 
 
 class DaskWorkers(Pool):
@@ -121,7 +114,8 @@ class DaskWorkers(Pool):
 
     def __init__(self, client: Any, work: Any) -> None:
         """Take them as Dask's client knows them."""
-        self.work, self._client, self._made = work, client, Made.of(work)
+        self.work, self._client = work, client
+        self._made = Made(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work), current())
 
     def names(self) -> list[str]:
         """Return their addresses, in order; at least one."""
@@ -154,12 +148,8 @@ class DaskWorkers(Pool):
 
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
-#: For each work, the thread that does it, and how.
-_prepared: dict[str, tuple[ThreadPoolExecutor, Any]] = {}
 
-
-@dataclass(frozen=True)
-class Made:
+class Made(NamedTuple):
     """Work on its way to the workers: a name for it, the folder that it was asked for in, itself, and its fence."""
 
     token: str
@@ -167,46 +157,30 @@ class Made:
     pickled: bytes
     fence: Fence | None
 
-    @classmethod
-    def of(cls, work: Any) -> Made:
-        """Wrap work that can be pickled."""
-        return cls(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work), current())
-
 
 def do_prepared(made: Made, task: Any) -> Any:
     """Do a task in the folder where it was asked for; make its work and this worker ready first, once.
 
     A worker outlives the work. So a thread of its own does it, inside the fence of whoever asked.
     """
-    if made.token not in _prepared:
-        for thread, _ in _prepared.values():  # of earlier runs, whose maps are no longer needed
-            thread.shutdown()
-        _prepared.clear()
-        thread = ThreadPoolExecutor(1)
-        _prepared[made.token] = thread, thread.submit(_prepare, made).result()
-    thread, do = _prepared[made.token]
+    thread, do = _made_ready(made)
     return thread.submit(do, task).result()
+
+
+@lru_cache(maxsize=1)  # maps of earlier runs are no longer needed
+def _made_ready(made: Made) -> tuple[ThreadPoolExecutor, Any]:
+    from distributed import Lock
+
+    from roadgeo.kernels.warmup import warm_up
+
+    with Lock(f"roadgeo: kernels of {socket.gethostname()}"):  # others wait for the files of the one that compiles
+        warm_up()
+    thread = ThreadPoolExecutor(1)
+    return thread, thread.submit(_prepare, made).result()
 
 
 def _prepare(made: Made) -> Any:
     """Make work ready on the thread that will do it."""
     os.chdir(made.folder)
     enter(made.fence)
-    from roadgeo.kernels.warmup import warm_up
-
-    with _one_of_host():
-        warm_up()
     return pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
-
-
-@contextlib.contextmanager
-def _one_of_host() -> Iterator[None]:
-    """Let one process of this host compile kernels while the others wait for its files."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    with (private_temporary_dir() / "compiling.lock").open("ab") as lock:  # where nobody else can take it
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

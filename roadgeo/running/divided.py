@@ -33,7 +33,7 @@ from roadgeo.matching.verdict import decide
 from roadgeo.matching.veto import contest
 from roadgeo.reference.opening import open_references
 from roadgeo.reference.shards import ShardedReference
-from roadgeo.running.cluster import Cluster, DaskWorkers
+from roadgeo.running.cluster import Cluster
 from roadgeo.running.locating import Locating, Outcome
 from roadgeo.running.pool import Lost
 from roadgeo.running.tasks import Task
@@ -95,8 +95,7 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
     parts = _parts_of(asked.references)
     able = {name: part for name, part in parts.items() if may_show(part, options, math.inf)} or parts
     sizes = {name: _size(part) for name, part in able.items()}
-    with cluster.connected() as client, Ahead(_AHEAD) as ahead:
-        workers = DaskWorkers(client, _Map(locating.references))
+    with cluster.connected(_Map(locating.references)) as workers, Ahead(_AHEAD) as ahead:
         locate = partial(_locate, workers.run, workers.names, sizes)
         yield from ahead.map(lambda task: locating.do(task, asked, locate), tasks)
 
