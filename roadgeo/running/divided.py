@@ -6,8 +6,8 @@ are read, traced and written where the batch was started. For each mask
 
 1. each worker takes a quick look at its parts;
 2. where no worker locates it, each worker searches its parts as thoroughly as was asked;
-3. the parts that hold places which may be reported are searched together, by the worker of the best of them: they are
-   judged as the maps of a library are.
+3. the parts that hold places which may be reported are searched together, by the worker whose place is the best: they
+   are judged as the maps of a library are.
 
 Places pay for the whole map in all three. A mask that no worker finds is refused with the words of the worker that came
 nearest.
@@ -33,7 +33,7 @@ from roadgeo.matching.verdict import decide
 from roadgeo.matching.veto import contest
 from roadgeo.reference.opening import open_references
 from roadgeo.reference.shards import ShardedReference
-from roadgeo.running.cluster import Cluster
+from roadgeo.running.cluster import Cluster, DaskWorkers
 from roadgeo.running.locating import Locating, Outcome
 from roadgeo.running.pool import Lost
 from roadgeo.running.tasks import Task
@@ -76,11 +76,10 @@ class _Parts(NamedTuple):
 
 
 class _PartAnswer(NamedTuple):
-    """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part."""
+    """The result of the search of parts, and which of them hold places that may be reported, or be rivals."""
 
     location: Location
-    places: Sequence[tuple[float, str]]
-    parts: Sequence[str]
+    strong: Sequence[str]
 
 
 def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> Iterator[Outcome]:
@@ -96,7 +95,7 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
     able = {name: part for name, part in parts.items() if may_show(part, options, math.inf)} or parts
     sizes = {name: _size(part) for name, part in able.items()}
     with cluster.connected(_Map(locating.references)) as workers, Ahead(_AHEAD) as ahead:
-        locate = partial(_locate, workers.run, workers.names, sizes)
+        locate = partial(_locate, workers, sizes)
         yield from ahead.map(lambda task: locating.do(task, asked, locate), tasks)
 
 
@@ -118,8 +117,7 @@ def _size(part: Part) -> int:
 
 
 def _locate(
-    run: Callable[[Sequence[_Parts]], Iterator[_PartAnswer]],
-    workers: Callable[[], Sequence[str]],
+    workers: DaskWorkers,
     sizes: Mapping[str, int],
     mask: RoadMask,
     references: Sequence[AnyReference],
@@ -135,33 +133,34 @@ def _locate(
     query = read_query(mask)
     # Each of the three searches may take the time limit: waiting for a worker that is busy with other masks is no part.
     limits = replace(options.search, time_limit_s=max(options.search.time_limit_s - query.seconds.vectorize, 0.0))
-    options, here = replace(options, search=limits), workers()
+    options = replace(options, search=limits)
 
-    def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> list[_PartAnswer]:
+    def search(searched: Mapping[str, Sequence[str]], options: LocateOptions) -> dict[str, _PartAnswer]:
         asked = []
         for worker, names in searched.items():
             share = larger(sum(sizes.values())) / larger(sum(sizes[name] for name in names))
             against = 2.0 * math.log10(share)  # as in `Rivals`, for the whole map
             asked.append(_Parts(worker, query, names, options, against))
-        return list(run(asked))
+        return dict(zip(searched, workers.run(asked), strict=True))
 
-    all_parts = owners(list(sizes), here)
+    all_parts = owners(list(sizes), workers.names())
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
     answers = search(all_parts, replace(options, effort="quick", search=least_work))
-    if not any(answer.location.located for answer in answers):
+    if not any(answer.location.located for answer in answers.values()):
         answers = search(all_parts, options)
-    best = max(answers, key=_rank)
-    if best.location.status == "not_located":
-        return _refused_by_all(best.location, [answer.location for answer in answers], references)
-    places = sorted((place for answer in answers for place in answer.places), reverse=True)
+    locations = {worker: answer.location for worker, answer in answers.items()}
+    nearest = max(locations, key=lambda worker: _rank(locations[worker]))
+    if locations[nearest].status == "not_located":
+        return _refused_by_all(locations[nearest], list(locations.values()), references)
+    strong = {name for answer in answers.values() for name in answer.strong}
     # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
-    chosen = list(dict.fromkeys(part for _, part in places)) or best.parts
-    return search({next(iter(owners(chosen[:1], here))): chosen}, options)[0].location
+    chosen = [name for name in sizes if name in strong] or all_parts[nearest]
+    return search({nearest: chosen}, options)[nearest].location
 
 
-def _rank(answer: _PartAnswer) -> tuple[bool, float]:
-    odds = answer.location.log10_odds
-    return answer.location.status != "not_located", -math.inf if odds is None else odds
+def _rank(location: Location) -> tuple[bool, float]:
+    odds = location.log10_odds
+    return location.status != "not_located", -math.inf if odds is None else odds
 
 
 def _refused_by_all(refusal: Location, others: Sequence[Location], references: Sequence[AnyReference]) -> Location:
@@ -184,36 +183,27 @@ class _Map:
 
     references: tuple[str, ...]
 
-    def prepare(self) -> _Searcher:
+    def prepare(self) -> Callable[[_Parts], _PartAnswer]:
         """Open the references, none of their shards."""
-        return _Searcher(_parts_of(open_references(self.references)))
+        return partial(_search, _parts_of(open_references(self.references)))
 
     def give_up(self, task: _Parts, lost: Lost) -> _PartAnswer:
         """Refuse to answer without a part of the map."""
         raise RoadgeoError(f"{task.query.name}: a part of the map has no answer: {lost.said}")
 
 
-@dataclass(frozen=True)
-class _Searcher:
-    """Searches parts of a map."""
-
-    parts: Mapping[str, Part]
-
-    def __call__(self, asked: _Parts) -> _PartAnswer:
-        """Search parts together."""
-        query, names, options = asked.query, asked.names, asked.options
-        parts = [self.parts[name] for name in names]
-        limit_s = options.search.time_limit_s
-        searched = contest(query, search_references(query, parts, options, limit_s), parts, options, limit_s)
-        searched = [result.less_likely(asked.against) for result in searched]
-        least = options.min_log10_odds - _BELOW
-        by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
-        strong = [place for result in searched for place in result.compared if place.score >= least]
-        places = [(place.score, by_path[_path(place.index)]) for place in strong]
-        return _PartAnswer(decide(query, searched, options), places, names)
+def _search(named: Mapping[str, Part], asked: _Parts) -> _PartAnswer:
+    """Search parts together."""
+    query, options = asked.query, asked.options
+    parts = {name: named[name] for name in asked.names}
+    here, limit_s = list(parts.values()), options.search.time_limit_s
+    searched = contest(query, search_references(query, here, options, limit_s), here, options, limit_s)
+    searched = [result.less_likely(asked.against) for result in searched]
+    least = options.min_log10_odds - _BELOW
+    strong = {Path(place.index.path) for result in searched for place in result.compared if place.score >= least}
+    return _PartAnswer(decide(query, searched, options), [name for name in parts if _path(parts[name]) in strong])
 
 
-def _path(part: Any) -> str:
-    """Return the file of a part, or of its index."""
-    path = getattr(part, "path", None)
-    return str(Path(part.index.path if path is None else path))
+def _path(part: Any) -> Path:
+    """Return where a part lies, which is not opened."""
+    return getattr(part, "path", None) or Path(part.index.path)

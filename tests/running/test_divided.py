@@ -144,7 +144,10 @@ class Slow:
         for asked in tasks:
             time.sleep(0.3)
             self.limits.append(asked.options.search.time_limit_s)
-            yield divided._PartAnswer(Location("q", "not_located", "nothing"), [], asked.names)
+            yield divided._PartAnswer(Location("q", "not_located", "nothing"), [])
+
+    def names(self):
+        return ["tcp://one"]
 
 
 def locate_on(pool, time_limit_s):
@@ -153,9 +156,7 @@ def locate_on(pool, time_limit_s):
     mask = np.zeros((64, 64), bool)
     mask[30:34] = mask[:, 30:34] = True
     traced_s = read_query(RoadMask(mask)).seconds.vectorize
-    found = divided._locate(
-        pool.run, lambda: ["tcp://one"], {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options
-    )
+    found = divided._locate(pool, {"0/": 100}, RoadMask(mask), [SimpleNamespace(name="")], options)
     return found, traced_s
 
 
@@ -170,6 +171,7 @@ def test_waiting_for_a_worker_is_no_time_of_the_search():
 
 def test_without_a_part_of_the_map_there_is_no_answer():
     lost = Lost("died", "the workers died")
-    pool = SimpleNamespace(run=lambda tasks: (divided._Map(()).give_up(task, lost) for task in tasks))
+    pool = Slow()
+    pool.run = lambda tasks: (divided._Map(()).give_up(task, lost) for task in tasks)
     with pytest.raises(RoadgeoError, match="a part of the map has no answer: the workers died"):
         locate_on(pool, 0.5)
