@@ -6,7 +6,7 @@ import asyncio
 import json
 import shutil
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -180,13 +180,8 @@ class Service:
 
     async def _events(self, request: Request) -> Response:
         """Send a job's state whenever it changes, as server-sent events."""
-        job = self._find(request)
-
-        async def tell() -> AsyncIterator[str]:
-            async for state in job.watch():
-                yield ": still here\n\n" if state is None else f"data: {json.dumps(state)}\n\n"
-
-        return StreamingResponse(tell(), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
+        events = (f"data: {json.dumps(state)}\n\n" async for state in self._find(request).watch())
+        return StreamingResponse(events, headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
     async def _shown(self, request: Request) -> Response:
         """Return the page's view of an answer."""

@@ -96,18 +96,14 @@ class Job:
         """Return its state as clients receive it."""
         return {"jobID": self.id, "status": self.status, "message": self.message, "progress": self.progress}
 
-    async def watch(self) -> AsyncIterator[dict[str, Any] | None]:
-        """Yield its state now and whenever that changes, until it is over; None where nothing happened for a while."""
-        while True:
+    async def watch(self) -> AsyncIterator[dict[str, Any]]:
+        """Yield its state now, whenever that changes, and when nothing happened for a while, until it is over."""
+        while not self.is_over:
             changed = self._changed
             yield self.to_dict()
-            if self.is_over:
-                return
-            while not changed.is_set():
-                try:
-                    await asyncio.wait_for(changed.wait(), _PULSE_S)
-                except TimeoutError:
-                    yield None
+            with suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), _PULSE_S)
+        yield self.to_dict()
 
 
 class Jobs:
@@ -140,9 +136,8 @@ class Jobs:
                 shutil.rmtree(folder, ignore_errors=True)
 
     def add(self, job: Job) -> None:
-        """Keep a job, and let go of the oldest that are over."""
+        """Keep a job."""
         self._all[job.id] = job
-        self.let_go()
 
     def find(self, name: str) -> Job:
         """Return a job by its name.
