@@ -24,7 +24,15 @@ from roadgeo.sources.osm_files import ASK_LESS, GAVE_UP, OSM_ENDINGS, stream_way
 from roadgeo.sources.schemas import is_filled, is_known_column, names_kinds
 from roadgeo.storage.memory import each_bounded
 from roadgeo.storage.unpacking import read_chunks
-from roadgeo.storage.vectors import beside, describe_layer, first_line, list_layers, read_layer
+from roadgeo.storage.vectors import (
+    Description,
+    beside,
+    describe_layer,
+    few_drivers,
+    first_line,
+    list_layers,
+    read_layer,
+)
 
 __all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables", "what_is_missing"]
 
@@ -148,16 +156,18 @@ def _stream_gdal(
 ) -> Iterator[RoadTable]:
     import shapely
 
-    parts = _choose_parts(path, asked, areas=areas)
-    for n, (held, column, levels) in enumerate(parts):
-        total, columns, hint = _choose_columns(path, held)
+    with few_drivers():
+        parts = _choose_parts(path, asked, areas=areas)
+        held = [_describe(path, part.layer) for part in parts]
+    for n, ((layer, column, levels), (said, columns, hint)) in enumerate(zip(parts, held, strict=True)):
+        total = said.n_features
         part, more = what_is_missing(path, total), [column] * (column not in ("", *columns))
         layers, limit = ", ".join(levels or [one.layer for one in parts]), most if total > most else None
         for skip in range(0, max(total, 1), most):
-            data = read_layer(path, held, [*columns, *more], skip, limit)
-            meta = {"format": data.driver, "layer": layers, **data.notes}
-            if data.shapes is None or data.driver == "CSV":  # GDAL knows one name of a column of shapes
-                yield _undeclared(path, held, skip, limit, meta)
+            data = read_layer(path, layer, [*columns, *more], skip, limit)
+            meta = {"format": said.driver, "layer": layers, **data.notes}
+            if data.shapes is None or said.driver == "CSV":  # GDAL knows one name of a column of shapes
+                yield _undeclared(path, layer, said, skip, limit, meta)
                 continue
             if len(data.shapes) < min(most, total - skip):
                 raise RoadSourceError(
@@ -170,14 +180,16 @@ def _stream_gdal(
             advance((n + min((skip + most) / max(total, 1), 1.0)) / len(parts))
 
 
-def _undeclared(path: Path, layer: str, skip: int, most: int | None, meta: dict[str, Any]) -> RoadTable:
+def _undeclared(
+    path: Path, layer: str, said: Description, skip: int, most: int | None, meta: dict[str, Any]
+) -> RoadTable:
     """Read a part of a layer without geometry, one of whose columns holds shapes."""
-    data = read_layer(path, layer, describe_layer(path, layer)[1], skip, most)
+    data = read_layer(path, layer, said.columns, skip, most)
     columns = dict(data.columns)
     taken = _take_shapes(columns)
     if taken is None:
         raise NoRoadsError(f"{path}: layer {layer!r} has no geometry, nor a column of WKT or WKB; expected lines")
-    if data.driver == "CSV" and len(taken[0]) and taken[0][-1] is None and _ends(path, 1)[1] not in b"\r\n":
+    if said.driver == "CSV" and len(taken[0]) and taken[0][-1] is None and _ends(path, 1)[1] not in b"\r\n":
         raise RoadSourceError(f"{path}: is cut off in its last line; copy or export it again")
     return RoadTable(taken[0], data.crs or taken[1] or None, columns, meta)
 
@@ -216,7 +228,7 @@ def _levels(path: Path, layer: str, areas: bool) -> tuple[str, list[str]]:
     """Return the column that names layers of a drawing, and those that hold lines (or polygons); "" without one."""
     import shapely
 
-    column = next((name for name in describe_layer(path, layer)[1] if name.lower() in _LEVELS), "")
+    column = next((name for name in describe_layer(path, layer).columns if name.lower() in _LEVELS), "")
     layer_read = read_layer(path, layer, [column]) if column else None
     if layer_read is None or layer_read.shapes is None:
         return "", []
@@ -234,25 +246,26 @@ def _names_of(values: AnyArray, path: Path) -> list[str]:
 
 def _is_filled(path: Path, layer: str) -> bool:
     try:
-        return describe_layer(path, layer)[0] > 0
+        return describe_layer(path, layer).n_features > 0
     except RoadSourceError:  # a view, which is refused only if it is the one to read
         return True
 
 
-def _choose_columns(path: Path, layer: str) -> tuple[int, list[str], str]:
-    """Return the size of a layer, and its columns that may describe a road: by their names, else by their values.
+def _describe(path: Path, layer: str) -> tuple[Description, list[str], str]:
+    """Return what a layer is, and its columns that may describe a road: by their names, else by their values.
 
     The third is which layers of a drawing its rows come from, for people; "" where this is unknown, or from one.
     """
-    total, fields = describe_layer(path, layer)
+    said = describe_layer(path, layer)
+    fields = said.columns
     chosen = [name for name in fields if is_known_column(name)]
     if not fields or {"highway", "fclass"} & {name.lower() for name in chosen}:
-        return total, chosen, ""
+        return said, chosen, ""
     head = read_layer(path, layer, fields, 0, _PEEK).columns
     column = next((name for name in fields if name.lower() in _LEVELS), "")
     levels = _names_of(head.get(column.lower(), np.empty(0, object)), path)
     hint = f"{column}: {listed(levels)}" if len(levels) > 1 else ""
-    return total, chosen + [name for name in fields if name not in chosen and names_kinds(head[name.lower()])], hint
+    return said, chosen + [name for name in fields if name not in chosen and names_kinds(head[name.lower()])], hint
 
 
 def _what_is_wrong(path: Path) -> str:

@@ -25,9 +25,11 @@ from roadgeo.storage.gdal import CONSENT, NETWORK, OWN_SHIFT, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
+    "Description",
     "VectorLayer",
     "beside",
     "describe_layer",
+    "few_drivers",
     "first_line",
     "list_layers",
     "read_layer",
@@ -47,6 +49,7 @@ _OWN_TABLES = (
 )
 
 _LOCK = threading.RLock()
+_alone = False  # whether the drivers that may read are the only ones; changed by whoever has the lock
 _BREAK = re.compile(r"[\t\r\n]")
 
 
@@ -58,7 +61,6 @@ class VectorLayer(NamedTuple):
     shapes : (N,) object, WKB, or None where the layer has no geometry
     columns : (N,) object each, by name
     crs : str or None
-    driver : str
     notes : dict
         `encoding`, where text was not in the encoding that the file names.
     """
@@ -66,8 +68,15 @@ class VectorLayer(NamedTuple):
     shapes: AnyArray | None
     columns: dict[str, AnyArray]
     crs: str | None
-    driver: str
     notes: dict[str, str]
+
+
+class Description(NamedTuple):
+    """What a file says of one of its layers."""
+
+    n_features: int
+    columns: list[str]
+    driver: str
 
 
 def list_layers(path: Path) -> list[tuple[str, str]]:
@@ -84,13 +93,13 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
         return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(file)]
 
 
-def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
-    """Return the number of features that a layer claims to hold, and its columns' names; errors as of `list_layers`."""
+def describe_layer(path: Path, layer: str) -> Description:
+    """Return what a layer claims to hold; errors as of `list_layers`."""
     import pyogrio
 
     with _guarded(path, layer) as file:
         info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
-        return int(info["features"]), [str(name) for name in info["fields"]]
+        return Description(int(info["features"]), [str(name) for name in info["fields"]], str(info["driver"]))
 
 
 def read_layer(
@@ -107,11 +116,10 @@ def read_layer(
         layer = layer or str(pyogrio.list_layers(file)[0][0])
         _require_stored(path, layer)
         part = {"skip_features": skip, "max_features": most, "columns": list(columns), "force_2d": True}
-        info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, **more))
         decoded, notes = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
     meta, _, shapes, values = decoded
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
-    return VectorLayer(shapes, named, meta["crs"], info["driver"], notes)
+    return VectorLayer(shapes, named, meta["crs"], notes)
 
 
 def _decoded(read: Callable[..., Any]) -> tuple[Any, dict[str, str]]:
@@ -139,7 +147,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
     _require_stored(path, layer)
     file = path
     try:
-        with _few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
+        with few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield file
     except (CRSError, UnboundLocalError) as error:  # the latter is pyogrio's
@@ -199,20 +207,30 @@ def _head(path: Path) -> bytes:
 
 
 @contextmanager
-def _few_drivers() -> Iterator[None]:
-    """Have pyogrio's GDAL know only the drivers above, and those that the user allows."""
+def few_drivers() -> Iterator[None]:
+    """Have pyogrio's GDAL know only the drivers above, and those that the user allows.
+
+    Each look at a file does so. To leave drivers out takes longer than most looks, so a caller with several holds this
+    around them.
+    """
+    global _alone
     import pyogrio
     from pyogrio import core
 
     with _LOCK:
+        if _alone:
+            yield
+            return
         kept = _DRIVERS | set(allowed_drivers())
         given = pyogrio.get_gdal_config_option("GDAL_SKIP")
         left_out = ",".join(sorted(set(pyogrio.list_drivers()) - kept))
         pyogrio.set_gdal_config_options({"GDAL_SKIP": f"{left_out},"})
         core._register_drivers()
+        _alone = True
         try:
             yield
         finally:
+            _alone = False
             pyogrio.set_gdal_config_options({"GDAL_SKIP": None if given == os.environ.get("GDAL_SKIP") else given})
             core._register_drivers()
 

@@ -104,11 +104,30 @@ def test_drivers_are_back_afterwards(tmp_path, monkeypatch):
     assert pyogrio.get_gdal_config_option("GDAL_HTTP_PROXY") is None
 
 
+def test_drivers_stay_left_out_until_the_last_who_needs_it_is_done():
+    before = pyogrio.list_drivers()
+    with vectors.few_drivers():
+        with vectors.few_drivers():
+            pass
+        assert {*pyogrio.list_drivers()} <= vectors._DRIVERS
+    assert pyogrio.list_drivers() == before
+
+
+def test_a_file_says_once_what_it_holds(tmp_path, monkeypatch):
+    """GDAL reads a whole GeoJSON file to say so."""
+    asked, real = [], pyogrio.read_info
+    path = tmp_path / "roads.geojson"
+    path.write_text(geojson())
+    monkeypatch.setattr(pyogrio, "read_info", lambda *args, **named: asked.append(args) or real(*args, **named))
+    assert len(read_lines(path).lines) == 1
+    assert len(asked) == 1
+
+
 def test_drivers_of_other_builds_of_gdal_are_left_out_too(monkeypatch):
     others = {"OGCAPI", "PostGISRaster", "ECW", "GDALG", "WMS", "WCS", "TileDB", "Zarr", "DAAS", "EEDA", "HTTP"}
     monkeypatch.setattr(pyogrio, "list_drivers", lambda: dict.fromkeys([*others, "GPKG"], "r"))
     monkeypatch.setattr(pyogrio.core, "_register_drivers", lambda: None)  # such a build
-    with vectors._few_drivers():
+    with vectors.few_drivers():
         assert {*pyogrio.get_gdal_config_option("GDAL_SKIP").split(",")} == {*others, ""}
 
 

@@ -366,13 +366,11 @@ def drivers_registered_once() -> Iterator[None]:
     And bound the memory that each file takes, as inside a fence.
     """
     os.environ[MEMORY] = "1"
-    with vectors._few_drivers():
-        vectors._few_drivers, kept = contextlib.nullcontext, vectors._few_drivers
-        try:
+    try:
+        with vectors.few_drivers():
             yield
-        finally:
-            vectors._few_drivers = kept
-            del os.environ[MEMORY]
+    finally:
+        del os.environ[MEMORY]
 
 
 def seeds(name: str) -> list[Path]:
