@@ -23,6 +23,9 @@ __all__ = ["Job", "Jobs", "Status"]
 
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
 
+#: The status of a job by that of its answer; otherwise it failed.
+_ENDS: dict[int, Status] = {200: "successful", 410: "dismissed"}
+
 #: Interval of messages that keep a listener's connection, seconds.
 _PULSE_S = 10.0
 
@@ -41,15 +44,18 @@ class Job:
         Its sender's name for it.
     hints : dict
         With which it is searched, as `requests.read_hints` gives them.
+    progress : int or None
+        Percent; None before a process takes it.
+    answer : Reply or None
+        Once there is one nothing more will become of it.
     """
 
     folder: Path
     image: str
     name: str
     hints: dict[str, Any]
-    status: Status = "accepted"
     message: str = "waiting for a free process"
-    progress: int = 0
+    progress: int | None = None
     answer: Reply | None = None
     called_off: threading.Event = field(default_factory=threading.Event)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
@@ -65,40 +71,38 @@ class Job:
         return self.folder / SENT / self.image
 
     @property
-    def is_over(self) -> bool:
-        """Whether nothing more will become of it."""
-        return self.status in ("successful", "failed", "dismissed")
+    def status(self) -> Status:
+        """How far it is."""
+        if self.answer is None:
+            return "accepted" if self.progress is None else "running"
+        return _ENDS.get(self.answer.status, "failed")
 
     def tell(self, text: str, share: float | None = None) -> None:
         """Record the progress."""
-        self._become("running", text, 0 if share is None else round(100 * min(max(share, 0.0), 1.0)))
+        self._become(text, 0 if share is None else round(100 * min(max(share, 0.0), 1.0)))
 
     def end(self, answer: Reply) -> None:
         """Keep the answer."""
-        succeeded = answer.status == 200
-        self.answer = None if self.is_over else answer
-        message = str(answer.document.get("reason" if succeeded else "detail", ""))
-        self._become("successful" if succeeded else "failed", message, 100)
+        self._become(str(answer.document.get("reason" if answer.status == 200 else "detail", "")), 100, answer)
 
     def call_off(self) -> None:
         """Have nobody wait for it any more."""
         self.called_off.set()
-        self._become("dismissed", "it was called off", self.progress)
+        self.end(Reply(410, {"detail": "it was called off"}))
 
-    def _become(self, status: Status, message: str, progress: int) -> None:
-        if self.is_over:
-            return
-        self.status, self.message, self.progress = status, message, progress
-        old, self._changed = self._changed, asyncio.Event()
-        old.set()
+    def _become(self, message: str, progress: int, answer: Reply | None = None) -> None:
+        if self.answer is None:
+            self.message, self.progress, self.answer = message, progress, answer
+            old, self._changed = self._changed, asyncio.Event()
+            old.set()
 
     def to_dict(self) -> dict[str, Any]:
         """Return its state as clients receive it."""
-        return {"jobID": self.id, "status": self.status, "message": self.message, "progress": self.progress}
+        return {"jobID": self.id, "status": self.status, "message": self.message, "progress": self.progress or 0}
 
     async def watch(self) -> AsyncIterator[dict[str, Any]]:
         """Yield its state now, whenever that changes, and when nothing happened for a while, until it is over."""
-        while not self.is_over:
+        while self.answer is None:
             changed = self._changed
             yield self.to_dict()
             with suppress(TimeoutError):
@@ -159,7 +163,7 @@ class Jobs:
 
     def make_room(self) -> None:
         """Forget the oldest that is over: the disk is full."""
-        oldest = next((job for job in self._all.values() if job.is_over), None)
+        oldest = next((job for job in self._all.values() if job.answer is not None), None)
         if oldest is not None:
             self.remove(oldest)
 
@@ -168,7 +172,7 @@ class Jobs:
 
         Nothing is kept on disk of jobs that failed.
         """
-        over = [job for job in self._all.values() if job.is_over]
+        over = [job for job in self._all.values() if job.answer is not None]
         for job in over:
             if job.status == "failed":
                 shutil.rmtree(job.folder, ignore_errors=True)
