@@ -1,5 +1,6 @@
 """Made-up road networks, and what a camera above them sees, with everything known; no mask is drawn."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -16,7 +17,7 @@ from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork, build_network
-from worlds.drawn import camera, mapped
+from worlds.drawn import camera, joined, mapped, vertices
 
 __all__ = [
     *("PLANE", "Sight", "camera", "estimator_of", "look", "mapped", "random_lines", "random_network", "scene_of"),
@@ -30,21 +31,23 @@ def random_lines(seed: int, side: float = 3000.0, spacing: float = 120.0) -> lis
     """Roads of a made-up town: a triangulation of scattered points, without what leaves a node too sharply."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, side, (int(3 * (side / spacing) ** 2), 2))
-    kept: list[int] = []
-    for i, point in enumerate(points):
-        if not kept or (np.hypot(*(points[kept] - point).T) > 0.75 * spacing).all():
-            kept.append(i)
-    xy = points[kept]
+    n = 0
+    xy = np.empty_like(points)
+    for point in points:
+        if (np.hypot(*(xy[:n] - point).T) > 0.75 * spacing).all():
+            xy[n] = point
+            n += 1
+    xy = xy[:n]
     triangles = Delaunay(xy).simplices
     pairs = np.unique(np.sort(np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])), axis=0)
     length = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
     taken: dict[int, list[float]] = {i: [] for i in range(len(xy))}
-    lines = []
-    for a, b in pairs[np.argsort(length)]:
-        angle = float(np.arctan2(*(xy[b] - xy[a])[::-1]))
+    lines, least = [], math.cos(math.radians(50))
+    angles = np.arctan2(*(xy[pairs[:, 1]] - xy[pairs[:, 0]]).T[::-1]).tolist()
+    for pair in np.argsort(length):
+        (a, b), angle = pairs[pair], angles[pair]
         at = ((a, angle), (b, angle + np.pi))
-        sharp = any(np.cos(angle - other) > np.cos(np.radians(50)) for n, angle in at for other in taken[n])
-        if sharp or length.max() < np.hypot(*(xy[a] - xy[b])):
+        if any(math.cos(angle - other) > least for n, angle in at for other in taken[n]):
             continue
         for n, angle in at:
             taken[n].append(angle)
@@ -97,25 +100,32 @@ def look(
             nodes.append(xy)
         return number[n] if n >= 0 else len(nodes) - 1
 
-    for e, (a, b) in enumerate(graph.edges):
+    chosen, drawn = [], []
+    for ends, line in zip(graph.edges, vertices(graph.lines(), 60.0), strict=True):
         if rng.uniform() < sight.missing:
             continue
-        line = np.array(shapely.segmentize(shapely.LineString(graph.polyline(e)), 60.0).coords)
         if sight.sigma_m:
             line[1:-1] += rng.normal(0, sight.sigma_m, (len(line) - 2, 2))
-        line[0], line[-1] = moved[a], moved[b]
-        line = np.array(shapely.segmentize(shapely.LineString(line), 10.0).coords)
-        ahead = np.c_[line, np.ones(len(line))] @ back[2] > 0
-        seen = mapped(back, line)
-        inside = ahead & (seen > low).all(axis=1) & (seen < high).all(axis=1)
-        runs = np.flatnonzero(np.diff(np.r_[0, inside.astype(int), 0]))
-        for start, stop in runs.reshape(-1, 2):
-            if stop - start < 2:
-                continue
-            piece = seen[start:stop]
-            ends = (a if start == 0 else -1, b if stop == len(line) else -1)
-            edges.append((node(ends[0], piece[0]), node(ends[1], piece[-1])))
-            lines.append(piece)
+        line[[0, -1]] = moved[ends]
+        chosen.append(ends)
+        drawn.append(line)
+    fine = vertices(joined(drawn), 10.0)
+    xy = np.concatenate(fine)
+    seen = mapped(back, xy)
+    ahead = xy @ back[2, :2] + back[2, 2] > 0
+    inside = ahead & (seen > low).all(axis=1) & (seen < high).all(axis=1)
+    line = np.repeat(np.arange(len(fine)), [*map(len, fine)])
+    first = np.diff(line, prepend=-1) > 0
+    last = np.roll(first, -1)
+    starts = np.flatnonzero(inside & (first | ~np.roll(inside, 1)))
+    stops = np.flatnonzero(inside & (last | ~np.roll(inside, -1))) + 1
+    for start, stop in zip(starts, stops, strict=True):
+        if stop - start < 2:
+            continue
+        (a, b), piece = chosen[line[start]], seen[start:stop]
+        ends = (a if first[start] else -1, b if last[stop - 1] else -1)
+        edges.append((node(ends[0], piece[0]), node(ends[1], piece[-1])))
+        lines.append(piece)
     for _ in range(int(sight.false * len(edges))):
         middle, angle = rng.uniform(low, high), rng.uniform(0, np.pi)
         reach = 0.02 * width * np.array([np.cos(angle), np.sin(angle)])
