@@ -24,7 +24,8 @@ class Homography:
     def __call__(self, xy: FloatArray) -> FloatArray:
         """Map (..., 2) points; those beyond the horizon (w <= 0) become NaN."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.ahead(xy)[..., None], self.everywhere(xy), np.nan)
+            mapped = self._homogeneous(xy)
+            return np.where(mapped[..., 2:] > 0, mapped[..., :2] / mapped[..., 2:], np.nan)
 
     def everywhere(self, xy: FloatArray) -> FloatArray:
         """Map (..., 2) points, also beyond the horizon: quicker where no point lies there (w > 0 over the image)."""

@@ -168,7 +168,7 @@ def _best_shifts(
     votes, some = np.zeros((span, span), np.uint16), np.zeros((span, span), np.uint8)
     for n, ((column, row), d) in enumerate(zip(cells[inside].tolist(), direction[inside].tolist(), strict=True), 1):
         some += layers[d, row : row + span, column : column + span]
-        if n % np.iinfo(np.uint8).max == 0:  # bytes are added several times as fast
+        if n % 255 == 0:  # a byte is full; they are added several times as fast
             votes += some
             some[:] = 0
     votes += some
