@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ class Service:
         with self.workers.take_place():
             pass  # whoever comes when it is full need not send an image first; who sends one slowly holds no place
         with self._jobs.room() as folder:
-            job = await _take(request, folder)
+            job = Job(folder, self._asked(*await _take(request, folder)))
             if "respond-async" in request.headers.get("prefer", "").lower():
                 return self._start(job, came, f"jobs/{job.id}")
             with self.workers.take_place():
@@ -117,17 +118,20 @@ class Service:
     async def _again(self, request: Request) -> Response:
         """Search for an image again, with other hints, as another job."""
         came, old, hints = time.time(), self._find(request), read_query_string(_query_of(request))
-        if not old.path.is_file():
+        if not Path(old.request.path).is_file():
             raise HTTPException(404, "its image is not kept: send it again")
         with self._jobs.room() as folder:
-            await asyncio.to_thread(_copy, old, folder, not hints.keys().isdisjoint(OF_ANSWERS))
-            return self._start(Job(folder, old.image, old.name, hints), came, f"../{folder.name}")
+            path = await asyncio.to_thread(_copy, old, folder, not hints.keys().isdisjoint(OF_ANSWERS))
+            return self._start(Job(folder, self._asked(path, old.request.name, hints)), came, f"../{folder.name}")
+
+    def _asked(self, path: Path, name: str, hints: dict[str, Any]) -> ImageRequest:
+        """Return what is asked of a process about an image."""
+        limit = min(hints.pop(LIMIT, self.options.time_limit_s), self.options.time_limit_s)
+        return ImageRequest(str(path), hints, limit, self.options.max_pixels, name)
 
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Reply:
         """Have a process locate an image, and report its place to the listener."""
-        loop, hints = asyncio.get_running_loop(), dict(job.hints)
-        limit = min(hints.pop(LIMIT, self.options.time_limit_s), self.options.time_limit_s)
-        task = ImageRequest(str(job.path), hints, limit, self.options.max_pixels, job.name, keeps)
+        loop, task = asyncio.get_running_loop(), replace(job.request, keeps=keeps)
 
         def say(text: str, share: float | None = None) -> None:
             with suppress(RuntimeError):  # the loop has ended
@@ -208,7 +212,7 @@ class Service:
         job, name = self._find(request), request.path_params["name"]
         if name not in OFFERED or job.status != "successful":
             raise HTTPException(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
-        task = ImageRequest(str(job.path), {}, _WRITE_S, self.options.max_pixels, wanted=name)
+        task = replace(job.request, time_limit_s=_WRITE_S, wanted=name)
         with self.workers.take_place():
             answer = await asyncio.get_running_loop().run_in_executor(self._threads, self.workers.ask, task)
         if answer.status >= 400:
@@ -268,8 +272,8 @@ def _query_of(request: Request) -> str:
     return query.decode("latin-1")
 
 
-async def _take(request: Request, folder: Path) -> Job:
-    """Take an image that is the body, or a file of a form; hints stand in the URL, and in the form."""
+async def _take(request: Request, folder: Path) -> tuple[Path, str, dict[str, Any]]:
+    """Take an image that is the body, or a file of a form; return its file, its name, and hints of the URL and form."""
     part, hints, name = folder / "part", read_query_string(_query_of(request)), ""
     if request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         async with request.form(max_files=1, max_fields=20, max_part_size=4096) as form:
@@ -290,17 +294,18 @@ async def _take(request: Request, folder: Path) -> Job:
     with part.open("rb") as file:
         ending = ending_of(file.read(16))
     image_path = part.rename(folder / SENT / f"{safe_stem(name)}{ending}")
-    return Job(folder, image_path.name, Path(name).name[:200], hints)
+    return image_path, Path(name).name[:200], hints
 
 
-def _copy(old: Job, folder: Path, takes: bool) -> None:
+def _copy(old: Job, folder: Path, takes: bool) -> Path:
     """Copy an image, with the roads seen in it, into another folder; its answer too, where a place of it is taken."""
-    shutil.copyfile(old.path, folder / SENT / old.image)
     for name in (SEEN, *[KEPT] * takes):
         kept = old.folder / OWN / name
         if kept.is_file():
             (folder / OWN).mkdir(exist_ok=True)
             shutil.copyfile(kept, folder / OWN / name)
+    image = Path(old.request.path)
+    return Path(shutil.copyfile(image, folder / SENT / image.name))
 
 
 def _report(listener: Listener, document: dict[str, Any], came: float) -> None:

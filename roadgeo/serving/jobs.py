@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.view import SENT
-from roadgeo.serving.workers import Reply
+from roadgeo.serving.workers import ImageRequest, Reply
 
 __all__ = ["Job", "Jobs", "Status"]
 
@@ -38,12 +38,8 @@ class Job:
     ----------
     folder : Path
         Holds the image in `sent`, and all of our own in folders beside that (see `view`). Its name is the job's.
-    image : str
-        The name of its file.
-    name : str
-        Its sender's name for it.
-    hints : dict
-        With which it is searched, as `requests.read_hints` gives them.
+    request : ImageRequest
+        What is asked of a process.
     progress : int or None
         Percent; None before a process takes it.
     answer : Reply or None
@@ -51,9 +47,7 @@ class Job:
     """
 
     folder: Path
-    image: str
-    name: str
-    hints: dict[str, Any]
+    request: ImageRequest
     message: str = "waiting for a free process"
     progress: int | None = None
     answer: Reply | None = None
@@ -64,11 +58,6 @@ class Job:
     def id(self) -> str:
         """The job's name."""
         return self.folder.name
-
-    @property
-    def path(self) -> Path:
-        """The file of the image."""
-        return self.folder / SENT / self.image
 
     @property
     def status(self) -> Status:
