@@ -114,7 +114,7 @@ class Pool(ABC):
                     result = ask(task)
                 yield self.work.give_up(task, result) if isinstance(result, Lost) else result
         finally:
-            threads.shutdown(wait=False, cancel_futures=True)
+            threads.shutdown(wait=False)
 
 
 # --- in a worker ------------------------------------------------------------------------------------------------------

@@ -55,6 +55,7 @@ def test_a_task_whose_worker_died_is_done_again_alone_and_then_lost() -> None:
     assert found[7] == "7: they died"
     assert (toys.begun.count(3), toys.begun.count(7)) == (2, 2)
     assert (toys.beside[3], toys.beside[7]) == (1, 1)
+    assert max(toys.beside.values()) <= 4
 
 
 def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
