@@ -119,15 +119,14 @@ class TestVote:
         )
         marked[1] = 0  # nothing in reach
         expected, tried_all = [], 0
+        marks = {s: naive.bits_of(marked[s]) for s in (0, 2)}
         for j in asked:
+            roads = naive.bits_of(places.rings[j])
             for turn in turns_of(rays, places[1:3], j):
                 if abs(math.remainder(turn - middle, 2 * math.pi)) <= max_off:
                     tried_all += 1
                     back = round(turn / (2 * math.pi) * BEARINGS)
-                    at = {
-                        s: naive.beyond_chance(naive.bits_of(marked[s]), naive.bits_of(places.rings[j]), back)
-                        for s in (0, 2)
-                    }
+                    at = {s: naive.beyond_chance(points, roads, back) for s, points in marks.items()}
                     s = max(at, key=at.get)
                     if at[s] > 0:
                         expected.append((at[s], j, turn, scales[s]))

@@ -202,6 +202,9 @@ class TestVertexProbes:
     def test_probe_exactly_what_is_alike(self, tolerance):
         rng = np.random.default_rng(3)
         every = [(u, v, sides) for u in range(UNITS) for v in range(u, UNITS) for sides in range(9)]
+        in_cells = {}
+        for u, v, sides in every:
+            in_cells.setdefault(pair_id(u // CELL_UNITS, v // CELL_UNITS), []).append((u, v, sides))
         for u1, u2 in np.sort(rng.integers(0, UNITS, (2, 2)), axis=1).tolist():
             own = int(rng.integers(9))
             probes = np.empty((64, 4), np.int64)
@@ -209,9 +212,8 @@ class TestVertexProbes:
             found = {
                 (u, v, sides)
                 for pair, lows, highs, alike in probes[:n].tolist()
-                for u, v, sides in every
-                if pair_id(u // CELL_UNITS, v // CELL_UNITS) == pair
-                and lows >> 4 <= u % CELL_UNITS <= highs >> 4
+                for u, v, sides in in_cells.get(pair, ())
+                if lows >> 4 <= u % CELL_UNITS <= highs >> 4
                 and lows & 15 <= v % CELL_UNITS <= highs & 15
                 and alike >> sides & 1
             }

@@ -174,8 +174,9 @@ class GivenUpError(Exception):
 
 
 def predict(p, u, v):
-    x, y, w = np.append(p, 1.0).reshape(3, 3) @ (u, v, 1.0)
-    return np.array([x / w, y / w])
+    a, b, c, d, e, f, g, h = map(float, p)
+    w = g * u + h * v + 1.0
+    return np.array([(a * u + b * v + c) / w, (d * u + e * v + f) / w])
 
 
 def predict_rows(p, u, v, step=1e-6):
