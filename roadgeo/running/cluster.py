@@ -167,12 +167,13 @@ def do_prepared(made: Made, task: Any) -> Any:
     return thread.submit(do, task).result()
 
 
-@lru_cache(maxsize=1)  # maps of earlier runs are no longer needed
+@lru_cache(maxsize=1)
 def _made_ready(made: Made) -> tuple[ThreadPoolExecutor, Any]:
     from distributed import Lock
 
     from roadgeo.kernels.warmup import warm_up
 
+    _made_ready.cache_clear()  # maps of earlier runs go before others are opened
     with Lock(f"roadgeo: kernels of {socket.gethostname()}"):  # others wait for the files of the one that compiles
         warm_up()
     thread = ThreadPoolExecutor(1)

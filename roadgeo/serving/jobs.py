@@ -72,14 +72,15 @@ class Job:
 
     def end(self, answer: Reply) -> None:
         """Keep the answer."""
-        self._become(str(answer.document.get("reason" if answer.status == 200 else "detail", "")), 100, answer)
+        message = str(answer.document.get("reason" if answer.status == 200 else "detail", ""))
+        self._become(message, self.progress if answer.status == 410 else 100, answer)
 
     def call_off(self) -> None:
         """Have nobody wait for it any more."""
         self.called_off.set()
         self.end(Reply(410, {"detail": "it was called off"}))
 
-    def _become(self, message: str, progress: int, answer: Reply | None = None) -> None:
+    def _become(self, message: str, progress: int | None, answer: Reply | None = None) -> None:
         if self.answer is None:
             self.message, self.progress, self.answer = message, progress, answer
             old, self._changed = self._changed, asyncio.Event()

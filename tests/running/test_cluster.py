@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
-from support.cluster_work import Squares
+from support.cluster_work import Maps, Squares
 from worlds.fenway import write_vector
 from worlds.scenes import PLANE, random_lines
 
@@ -105,6 +105,10 @@ def test_killed_workers_lose_nothing_and_what_kills_them_all_is_given_up(schedul
     assert [result for n, result in enumerate(found) if n != 17] == [n * n for n in range(20) if n != 17]
     assert found[17].startswith("17: the workers that it was given to died")
     assert len(found) == 20
+
+
+def test_a_worker_lets_go_of_an_earlier_runs_maps_before_it_opens_others(scheduler):
+    assert [list(Cluster(scheduler).run(range(8), Maps())) for _ in range(2)] == [[0] * 8] * 2
 
 
 def test_shards_and_masks_come_out_as_from_one_process(scheduler, tmp_path, monkeypatch, capsys):

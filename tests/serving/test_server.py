@@ -560,7 +560,9 @@ def test_a_job_is_called_off_and_forgotten():
     with serving(workers) as server:
         job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
         assert ask(server, "POST", "/locate", PNG)[0].status == 503
-        assert ask(server, "DELETE", f"/jobs/{job}")[1]["status"] == "dismissed"
+        wait_for(server, job, "running")
+        called_off = ask(server, "DELETE", f"/jobs/{job}")[1]
+        assert (called_off["status"], called_off["progress"]) == ("dismissed", 50)
         assert ask(server, "GET", f"/jobs/{job}")[0].status == 404
         wait_until(lambda: workers.places._value)
         workers.goes_on.set()

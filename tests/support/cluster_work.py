@@ -4,8 +4,9 @@ import os
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+from weakref import WeakSet
 
-__all__ = ["Squares"]
+__all__ = ["Maps", "Squares"]
 
 
 @dataclass(frozen=True)
@@ -29,3 +30,22 @@ class Squares:
         if task == self.always or (task in self.once and seen.read_text().count("\n") == 1):
             os.kill(os.getpid(), signal.SIGKILL)
         return task * task
+
+
+class Map:
+    """Takes memory."""
+
+    def opened_beside(self, others):
+        return others
+
+
+_open = WeakSet()
+
+
+class Maps:
+    """Opens a map; each result is how many were open in its process already."""
+
+    def prepare(self):
+        others, mine = len(_open), Map()
+        _open.add(mine)
+        return lambda _: mine.opened_beside(others)
