@@ -15,6 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,6 +207,14 @@ def _head(path: Path) -> bytes:
         return file.read(512).lstrip(b"\xef\xbb\xbf \t\r\n")
 
 
+@cache
+def _drivers(_skipped: str | None) -> set[str]:
+    """Return the names of all drivers of pyogrio's GDAL, of which some are skipped: to list them takes a while."""
+    import pyogrio
+
+    return set(pyogrio.list_drivers())
+
+
 @contextmanager
 def few_drivers() -> Iterator[None]:
     """Have pyogrio's GDAL know only the drivers above, and those that the user allows.
@@ -223,7 +232,7 @@ def few_drivers() -> Iterator[None]:
             return
         kept = _DRIVERS | set(allowed_drivers())
         given = pyogrio.get_gdal_config_option("GDAL_SKIP")
-        left_out = ",".join(sorted(set(pyogrio.list_drivers()) - kept))
+        left_out = ",".join(sorted(_drivers(given) - kept))
         pyogrio.set_gdal_config_options({"GDAL_SKIP": f"{left_out},"})
         core._register_drivers()
         _alone = True
