@@ -123,7 +123,12 @@ class Processes(Pool):
 
     def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
         """Have the next one that is free do a task. One that has no result for it is started anew."""
-        process = self._idle.get()
+        while True:
+            with contextlib.suppress(queue.Empty):
+                process = self._idle.get(timeout=_GLANCE_S)
+                break
+            if called_off.is_set():
+                return _CALLED_OFF
         try:
             if called_off.is_set():
                 return _CALLED_OFF
@@ -208,7 +213,11 @@ class _Process:
             except (EOFError, OSError):
                 return Lost("died", "the process that worked on it died (out of memory?)")
             if kind == "told":
-                say(*said)
+                try:
+                    say(*said)
+                except BaseException:
+                    self.end(0.0)  # its answer would be taken for that of the next task
+                    raise
         self._start_s = 0.0
         if kind == "failed":
             raise said

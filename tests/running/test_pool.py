@@ -144,6 +144,27 @@ def test_what_takes_too_long_or_is_called_off_is_ended(pool: Pool) -> None:
     assert done(pool, "") == before  # nobody had begun
 
 
+def test_who_is_called_off_does_not_wait_for_a_process(pool: Pool) -> None:
+    assert done(pool, "")
+    called_off, ends = threading.Event(), threading.Event()
+    beside = threading.Thread(target=done, args=(pool, "wait"), kwargs={"called_off": ends})
+    beside.start()
+    while not pool._idle.empty():
+        time.sleep(0.01)
+    threading.Timer(0.1, called_off.set).start()
+    assert done(pool, "", called_off=called_off).why == "called off"
+    assert pool._idle.empty()
+    ends.set()
+    beside.join()
+
+
+def test_who_fails_to_hear_the_progress_leaves_no_answer_to_the_next(pool: Pool) -> None:
+    with pytest.raises(ZeroDivisionError):
+        done(pool, "tell", say=lambda *_: 1 / 0)
+    with pytest.raises(RoadgeoError, match="no road"):
+        done(pool, "fail")
+
+
 def test_processes_that_cannot_prepare_say_why() -> None:
     processes = Processes(Tasks(prepares=False), 1, grace_s=0.0)
     for _ in range(2):
