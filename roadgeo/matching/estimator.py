@@ -30,7 +30,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.road_search import RoadRound, RoadSearch, Turnout
+from roadgeo.matching.road_search import RoadRound, RoadSearch
 from roadgeo.matching.scene import AGREE_DEG, LEAST_SHARE, NOTICEABLE
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
@@ -203,10 +203,10 @@ class TripleEstimator:
         """Yield the rounds of an anchor: one, or one of each unit, where the map is searched alone."""
         args = self.scene, self.index, self.options.camera, self.near, self.sweeps.ahead
         if not self.sweeps.alone:
-            searches = [RoadSearch(*args, self.sweeps.turnout(self.index.coarseness))]
+            searches = [RoadSearch(*args)]
         else:
             units = (np.flatnonzero(self.units == unit) for unit in range(n_units(len(self.index))))
-            searches = [RoadSearch(*args, Turnout(len(own)), own) for own in units]
+            searches = [RoadSearch(*args, own) for own in units]
         for rounds in zip_longest(*(search.rounds() for search in searches)):
             yield [one for one in rounds if one is not None]
 

@@ -17,7 +17,6 @@ from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions
-from roadgeo.matching.road_search import Turnout
 from roadgeo.matching.scene import MAX_COSTLY, MIN_COS, Scene, and_pixels
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import Proposals, Sweep
@@ -142,7 +141,6 @@ class SharedSweeps:
         self.members: list[Member] = []
         self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
         self._done: dict[int, list[_Grown]] = {}
-        self._turnouts: dict[float, Turnout] = {}
 
     def rounds(self, member: Member, sweep: Sweep) -> Iterator[list[Place]]:
         """Yield the places that grew on a part from each anchor's proposals, until enough were screened."""
@@ -157,11 +155,6 @@ class SharedSweeps:
                 done.append(grown)
             yield done[n].pop(id(member), [])
             n += 1
-
-    def turnout(self, coarseness: float) -> Turnout:
-        """Return the number of intersections that vote, the same on all parts of this coarseness."""
-        n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
-        return self._turnouts.setdefault(coarseness, Turnout(n_map))
 
     def end(self) -> None:
         """Drop the parts: each refers to this object, and the cycle would keep their maps open for a while."""

@@ -195,9 +195,8 @@ def _search(
     sweeps.end()
     if units > 1 and not any(search.stopped in ("accepted", "time") for search in estimators):
         left, scale = left - (time.perf_counter() - started), float(units)
-        estimators = _search_alone(together, options, ledger, left, ahead, say)
-        rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
-    searches = iter(estimators)
+        rivals = _search_alone(together, options, ledger, left, ahead, say)
+    searches = iter(rivals.estimators)
     return [
         result if result.estimator is None else _end(result, result.estimator, next(searches), rivals, scale)
         for result in begun
@@ -211,10 +210,10 @@ def _search_alone(
     time_limit_s: float,
     ahead: Ahead,
     say: Say,
-) -> dict[Search[Place], TripleEstimator]:
+) -> Rivals:
     """Search each part, and each unit of it, as if it were alone: leads compete, each on its own part.
 
-    The more is searched in all, by the `ledger`, the more a place must lead.
+    Returns what compared the places of each. The more is searched in all, by the `ledger`, the more a place must lead.
     """
     for estimator in estimators:
         estimator.leave_company()
@@ -230,7 +229,7 @@ def _search_alone(
     search_each(limits, rivals.stands, rivals.promise, _name_maps(searches, say))
     for estimator in estimators:
         estimator.sweeps.end()
-    return searches
+    return rivals
 
 
 def _name_maps(searches: Mapping[Search[Place], TripleEstimator], say: Say) -> Callable[[Search[Place]], None]:

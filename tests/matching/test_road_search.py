@@ -17,7 +17,6 @@ from roadgeo.matching.road_search import (
     RING_STEP,
     RoadGrower,
     RoadSearch,
-    Turnout,
     Voter,
     make_raster,
     ring_of,
@@ -144,34 +143,19 @@ def test_work_is_bounded(town, broken, monkeypatch):
         roads = RoadSearch(broken, town[1], CameraOptions())
         return len(list(roads.rounds()))
 
-    assert n_anchors() == len(broken.intersections)
-    assert n_anchors(MAX_ANCHORS=5) == 5
-    assert n_anchors(_MAX_TRIED=1, _LEAST_ANCHORS=3) == 3
+    assert n_anchors() == min(len(broken.intersections), road_search.N_VOTING)
+    assert n_anchors(N_VOTING=5) == 5
 
 
-def test_parts_share_what_may_be_tried(monkeypatch):
-    monkeypatch.setattr(road_search, "_MAX_TRIED", 100)
-    monkeypatch.setattr(road_search, "_LEAST_ANCHORS", 2)
-    turnout = Turnout(n_map=15_000)
-    assert turnout.includes(0)
-    turnout.n_tried = 60
-    assert turnout.includes(1)
-    assert turnout.includes(2)
-    turnout.n_tried = 120  # by another part
-    assert turnout.includes(2)  # decided by the first that came to it
-    assert not turnout.includes(3)
-    turnout.n_tried = 0
-    assert not turnout.includes(3)
-    assert turnout.last == 3
-
-
-def test_more_may_be_tried_on_a_larger_map(monkeypatch):
-    monkeypatch.setattr(road_search, "_MAX_TRIED", 100)
-    monkeypatch.setattr(road_search, "_LEAST_ANCHORS", 1)
-    larger = Turnout(n_map=60_000, n_tried=150)
-    assert larger.includes(1)
-    larger.n_tried = 200
-    assert not larger.includes(2)
+def test_parts_of_a_map_share_what_an_intersection_sees(town, broken):
+    index = town[1]
+    parts = [RoadSearch(broken, index, CameraOptions(), among=np.arange(k, len(index), 2)) for k in range(2)]
+    before = road_search._look_around.cache_info()
+    for part in parts:
+        part.voter.votes(0)
+    after = road_search._look_around.cache_info()
+    assert after.misses - before.misses <= 1
+    assert after.hits > before.hits
 
 
 def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
