@@ -333,12 +333,11 @@ def _of_two_colours(raster: Bands, observed: AnyArray) -> Bands:
 def _of_colours(raster: Bands) -> Bands:
     """Take all but the ground, which is black or white, for road where each road has a colour of its own."""
     values, valid = _middle(raster)
-    if values.shape[2] == 1 or values.dtype.kind not in "iu":
+    if values.dtype.kind not in "iu" or not _coloured(values):
         return raster
     for ground in (0, np.iinfo(values.dtype).max):
         shown = (values != ground).any(axis=2) & _finite(values, valid)
-        packed = values.astype(np.int64) @ [1, 1 << 20, 1 << 40][: values.shape[2]]
-        if _coloured(values[shown]) and are_roads(shown) and are_patches(packed, shown):
+        if _coloured(values[shown]) and are_roads(shown) and are_patches(_packed(values), shown):
             _LOG.warning("%s: holds a colour for each of its roads: all but its ground is road", raster.name)
             drawn = _changed(raster, partial(_unlike, ground))
             return replace(drawn, bands=raster.bands[:1])
@@ -346,8 +345,14 @@ def _of_colours(raster: Bands) -> Bands:
 
 
 def _coloured(values: AnyArray) -> bool:
-    """Whether any of (n, B) values are other than grey."""
-    return bool((values[:, 1:] != values[:, :1]).any())
+    """Whether any of (..., B) values are other than grey."""
+    return any(bool((values[..., band] != values[..., 0]).any()) for band in range(1, values.shape[-1]))
+
+
+def _packed(values: AnyArray) -> AnyArray:
+    """Return one number for each colour (..., B)."""
+    packed: AnyArray = values @ np.array([1, 1 << 20, 1 << 40][: values.shape[-1]])
+    return packed
 
 
 def _unlike(ground: int, values: AnyArray, valid: BoolArray | None) -> _Rows:
