@@ -103,11 +103,11 @@ def line_through(points: FloatArray) -> Any:
     import shapely
 
     finite = np.isfinite(points).all(axis=1)
-    cuts = np.flatnonzero(np.diff(finite)) + 1
-    pieces = [
-        part for part, is_finite in zip(np.split(points, cuts), np.split(finite, cuts), strict=True) if all(is_finite)
-    ]
-    lines = [shapely.LineString(piece) for piece in pieces if len(np.unique(piece, axis=0)) > 1]
+    pieces = [points]
+    if not finite.all():
+        cuts = np.flatnonzero(np.diff(finite)) + 1
+        pieces = [piece for piece in np.split(points, cuts) if np.isfinite(piece).all()]
+    lines = [shapely.linestrings(piece) for piece in pieces if (piece[1:] != piece[:1]).any()]
     return shapely.MultiLineString(lines) if len(lines) > 1 else next(iter(lines), None)
 
 
