@@ -275,13 +275,16 @@ def _find_fills(name: str, values: AnyArray, valid: BoolArray) -> tuple[list[Any
     fills: list[AnyArray] = []
     corners = values[[0, 0, -1, -1], [0, -1, 0, -1]]
     for fill in np.unique([np.full_like(seen[:, 0], end) for end in (seen.min(), seen.max())] + [*corners], axis=0):
-        rest = seen[:, (seen != fill[:, None]).any(axis=0)]
+        alike = (values == fill).all(axis=2) & valid
+        if np.count_nonzero(alike) < min(_FILL_AREA_PX, _VOID_AREA_PX, alike.size // 10):  # no patch is so small
+            continue
+        rest = seen[:, ~alike[valid]]
         if all(len(np.unique(rest[:, ::step])) < _MANY_VALUES for step in (_COARSE, 1)):  # all where a few do not tell
             continue
         least, greatest = float(rest.min()), float(rest.max())
         is_apart = max(least - float(fill.max()), float(fill.min()) - greatest) > greatest - least
         is_sure = is_apart or np.count_nonzero((corners == fill).all(axis=1)) > 1
-        is_fill = find_voids((values == fill).all(axis=2) & valid, least=_FILL_AREA_PX if is_sure else None)
+        is_fill = find_voids(alike, least=_FILL_AREA_PX if is_sure else None)
         if is_fill.any() and (valid & ~is_fill).sum() >= _SHOWN_SHARE * valid.sum():
             fills.append(fill)
             edges = cv2.dilate(is_fill.view(np.uint8), np.ones((_VOID_CORE_PX, _VOID_CORE_PX), np.uint8)) > 0
