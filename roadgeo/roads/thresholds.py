@@ -297,20 +297,23 @@ def refuse_different_bands(sample: Sample) -> None:
 
     A photograph is left alone: it has three bands, none of which is crisp, and which do not add up to one value.
     """
-    values = sample.observed.astype(np.float64)
-    span = np.ptp(values, axis=0)
-    shown = span > (_FAINT * span.max() if values.shape[1] > 2 else 0.0)  # colours may have traces of others
+    bands = np.ascontiguousarray(sample.observed.T)
+    if (bands == bands[0]).all():
+        return
+    bands = bands.astype(np.float64)
+    span = np.ptp(bands, axis=1)
+    shown = span > (_FAINT * span.max() if len(bands) > 2 else 0.0)  # colours may have traces of others
     if np.count_nonzero(shown) < 2:
         return
-    shares = (values - values.min(axis=0))[:, shown] / span[shown]
-    is_crisp = (np.minimum(shares, 1.0 - shares) < _CRISP_SHARE).mean(axis=0) > 1.0 - _CRISP_SHARE
-    if shares.shape[1] > 2 and not is_crisp.any() and values.sum(axis=1).std() > _FAINT * values.std(axis=0).sum():
+    shares = (bands[shown] - bands[shown].min(axis=1, keepdims=True)) / span[shown, None]
+    is_crisp = (np.minimum(shares, 1.0 - shares) < _CRISP_SHARE).mean(axis=1) > 1.0 - _CRISP_SHARE
+    if len(shares) > 2 and not is_crisp.any() and bands.sum(axis=0).std() > _FAINT * bands.std(axis=1).sum():
         return
-    first = shares[:, np.argmax(is_crisp)]
+    first = shares[np.argmax(is_crisp)]
     roads = min(np.mean(first > 0.5), np.mean(first <= 0.5))
-    apart = [min(np.mean(np.abs(band - like) > _FAR) for like in (first, 1.0 - first)) for band in shares.T]
+    apart = [min(np.mean(np.abs(band - like) > _FAR) for like in (first, 1.0 - first)) for band in shares]
     if max(apart) > _MOST_APART * roads:
-        if values.shape[1] == 3 and len(sample.levels) > 2:
+        if len(bands) == 3 and len(sample.levels) > 2:
             _refuse_colours(sample, sample.levels)
         raise _several_bands(sample)
 

@@ -294,11 +294,13 @@ def _without_fill(raster: Bands, observed: AnyArray) -> Bands:
     """
     for end in () if len(observed) == 0 else (observed.min(), observed.max()):
         is_fill = (observed == end).all(axis=1)
-        others = observed[~is_fill].astype(np.float64)
-        if not is_fill.any() or len(np.unique(others)) < _MANY_VALUES:
+        others = np.unique(observed[~is_fill])
+        if not is_fill.any() or len(others) < _MANY_VALUES:
             continue
-        apart = max(others.min() - float(end), float(end) - others.max())
-        if apart > np.ptp(others) and not are_roads((_middle(raster)[0] == end).all(axis=2)):
+        least, greatest = float(others[0]), float(others[-1])
+        if max(least - float(end), float(end) - greatest) > greatest - least and not are_roads(
+            (_middle(raster)[0] == end).all(axis=2)
+        ):
             _LOG.warning("%s: its value %g, far from all others, is taken for not observed", raster.name, end)
             return _changed(raster, partial(_all_but, end))
     return raster
