@@ -71,7 +71,7 @@ class Cluster:
         Raises
         ------
         RoadgeoError
-            Dask is not installed; there is no scheduler at the address, or it went away.
+            Dask is not installed; there is no scheduler at the address, or it or all its workers went away.
         """
         with self.connected(work) as workers:
             yield from workers.run(tasks)
@@ -131,19 +131,28 @@ class DaskWorkers(Pool):
         Raises
         ------
         RoadgeoError
-            The scheduler went away.
+            The scheduler went away, or all workers for good: Dask restarts none that dies while it starts.
         """
+        from distributed import wait
         from distributed.scheduler import KilledWorker
 
         worker = getattr(task, "worker", "")
         where = {"workers": [worker], "allow_other_workers": True} if worker else {}
         future = self._client.submit(do_prepared, self._made, task, pure=False, **where)
         try:
+            while not future.done():
+                try:
+                    wait(future, _PATIENCE_S)
+                except TimeoutError:
+                    self._client.wait_for_workers(1, timeout=_PATIENCE_S)
             return future.result()
         except KilledWorker:
             return Lost("died", "the workers that it was given to died, one after another")
         except (CancelledError, OSError) as error:
-            raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
+            if future.status == "error":  # it is the task's
+                raise
+            what = "the Dask scheduler, or all its workers, went away"
+            raise RoadgeoError(f"{what}; the same command with --skip-existing goes on") from error
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------

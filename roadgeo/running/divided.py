@@ -128,7 +128,7 @@ def _locate(
     Raises
     ------
     RoadgeoError
-        Workers died of it, one after another, or the scheduler went away.
+        Workers died of it, one after another, or the scheduler, or all workers, went away.
     """
     query = read_query(mask)
     # Each of the three searches may take the time limit: waiting for a worker that is busy with other masks is no part.

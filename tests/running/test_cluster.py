@@ -140,6 +140,18 @@ def test_without_a_scheduler_processes_of_this_machine_do_it(scheduler, tmp_path
     assert set(counts(tmp_path).values()) == {1}
 
 
+def test_workers_that_all_went_away_are_said_and_an_error_of_a_task_is_its_own(tmp_path, monkeypatch):
+    from roadgeo.running import cluster
+
+    with Cluster().connected(Squares(str(tmp_path / "nonesuch"))) as workers:
+        with pytest.raises(FileNotFoundError):
+            list(workers.run([1]))
+        monkeypatch.setattr(cluster, "_PATIENCE_S", 0.5)
+        workers._client.retire_workers(workers.names())
+        with pytest.raises(RoadgeoError, match="its workers, went away"):
+            list(workers.run([1]))
+
+
 def test_without_dask_the_command_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(RoadgeoError, match=r"-m pip install dask"):
