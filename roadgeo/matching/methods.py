@@ -213,7 +213,7 @@ def _search_alone(
 ) -> Rivals:
     """Search each part, and each unit of it, as if it were alone: leads compete, each on its own part.
 
-    Returns what compared the places of each. The more is searched in all, by the `ledger`, the more a place must lead.
+    Returns the comparison of their places. The more is searched in all, by the `ledger`, the more a place must lead.
     """
     for estimator in estimators:
         estimator.leave_company()

@@ -172,9 +172,8 @@ _SCALE_STEPS = np.array([0.96, 1.04])
 #: Roads nearer than this, metres, that run straight away from the intersection are left out: they are its own branches,
 #: which agree by construction. The right place then stands out more.
 _OWN_M = 150.0
-#: Number of query intersections that vote. Of 96 masks with 40 % of the roads gone and 40 % false that were located on
-#: the map of their city, 94 were from the first 20. With 30, a search of 33 cities without a result takes a third
-#: longer.
+#: Number of query intersections that vote. 94 of 96 masks with 40 % of the roads gone and 40 % false that were located
+#: on the map of their city were from the first 20. A search of 33 cities without a result takes a third longer with 30.
 N_VOTING = 20
 #: Number of the best proposals that are judged anew.
 _KEPT = 400

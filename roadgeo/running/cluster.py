@@ -38,7 +38,7 @@ _AHEAD = 2
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
 
-#: Of a cluster on this machine. Its scheduler serves its status at any port, for one may be taken.
+#: Settings of a cluster on this machine. Its scheduler serves its status at any port, for one may be taken.
 _SETTINGS = {"distributed.worker.multiprocessing-method": "spawn", "distributed.logging.distributed": "error"}
 _LOCAL: dict[str, Any] = {
     "threads_per_worker": 1,

@@ -37,14 +37,14 @@ _MAX_BANDS = 16
 
 
 class PilImage(Protocol):
-    """What is used of a PIL image."""
+    """The used part of a PIL image."""
 
     def getbands(self) -> tuple[str, ...]:
         """Return the names of its bands."""
 
 
 class XarrayArray(Protocol):
-    """What is used of an xarray DataArray."""
+    """The used part of an xarray DataArray."""
 
     @property
     def dims(self) -> Any:
@@ -56,7 +56,7 @@ class XarrayArray(Protocol):
 
 
 class RasterioDataset(Protocol):
-    """What is used of a rasterio dataset."""
+    """The used part of a rasterio dataset."""
 
     @property
     def name(self) -> str:

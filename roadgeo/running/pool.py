@@ -83,7 +83,7 @@ class Pool(ABC):
     ) -> Iterator[Any]:
         """Do all tasks and yield their results in order, each as soon as it and those before it are there.
 
-        Once nobody reads any more no task begins; what is under way goes on until the workers are ended.
+        Once nobody reads any more no task begins; those under way go on until the workers are ended.
 
         Parameters
         ----------

@@ -216,7 +216,7 @@ class _Process:
                 try:
                     say(*said)
                 except BaseException:
-                    self.end(0.0)  # its answer would be taken for that of the next task
+                    self.end(0.0)  # its answer would be taken for the next task's
                     raise
         self._start_s = 0.0
         if kind == "failed":

@@ -125,7 +125,7 @@ class Service:
             return self._start(Job(folder, self._asked(path, old.request.name, hints)), came, f"../{folder.name}")
 
     def _asked(self, path: Path, name: str, hints: dict[str, Any]) -> ImageRequest:
-        """Return what is asked of a process about an image."""
+        """Return the task of a process for an image."""
         limit = min(hints.pop(LIMIT, self.options.time_limit_s), self.options.time_limit_s)
         return ImageRequest(str(path), hints, limit, self.options.max_pixels, name)
 

@@ -23,7 +23,7 @@ __all__ = ["Job", "Jobs", "Status"]
 
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
 
-#: The status of a job by that of its answer; otherwise it failed.
+#: The status of a job by its answer's; otherwise it failed.
 _ENDS: dict[int, Status] = {200: "successful", 410: "dismissed"}
 
 #: Interval of messages that keep a listener's connection, seconds.
@@ -39,7 +39,7 @@ class Job:
     folder : Path
         Holds the image in `sent`, and all of our own in folders beside that (see `view`). Its name is the job's.
     request : ImageRequest
-        What is asked of a process.
+        The task of a process.
     progress : int or None
         Percent; None before a process takes it.
     answer : Reply or None

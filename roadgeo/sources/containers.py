@@ -252,7 +252,7 @@ def _is_filled(path: Path, layer: str) -> bool:
 
 
 def _describe(path: Path, layer: str) -> tuple[Description, list[str], str]:
-    """Return what a layer is, and its columns that may describe a road: by their names, else by their values.
+    """Describe a layer, and choose its columns that may describe a road: by their names, else by their values.
 
     The third is which layers of a drawing its rows come from, for people; "" where this is unknown, or from one.
     """

@@ -73,7 +73,7 @@ class VectorLayer(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a file says of one of its layers."""
+    """A layer as its file describes it."""
 
     n_features: int
     columns: list[str]
@@ -95,7 +95,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
 
 
 def describe_layer(path: Path, layer: str) -> Description:
-    """Return what a layer claims to hold; errors as of `list_layers`."""
+    """Describe a layer, as its file claims; errors as of `list_layers`."""
     import pyogrio
 
     with _guarded(path, layer) as file:
