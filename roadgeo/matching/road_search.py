@@ -282,9 +282,9 @@ class Voter:
             self.candidates, around.rays, round(ROAD_TURN * _PER_RADIAN), turn, max_off, around.points.scales,
             around.rings, FEWEST, self.places, found,
         )  # fmt: skip
-        args = _TURN_STEPS, _SCALE_STEPS, around.points, self.places, self.drawn.raster, _TRIAL
-        improve_votes(found[:kept], *args)
-        best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
+        found = found[:kept]
+        improve_votes(found, _TURN_STEPS, _SCALE_STEPS, around.points, self.places, self.drawn.raster, _TRIAL)
+        best = found[np.argsort(-found[:, 3], kind="stable")]
         c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
         return Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3], tried)
 
