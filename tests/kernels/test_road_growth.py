@@ -129,7 +129,7 @@ def test_side_by_side_they_grow_as_alone(roads):
 
 def test_grows_like_the_twin(roads):
     network, buckets = roads
-    points, along = (array[::8] for array in seen(network, truth(), false=0.3))
+    points, along = (array[::8].copy() for array in seen(network, truth(), false=0.3))
     ps, origins = rough_starts(4)
     stages = STAGES._replace(least_share=0.0, go_on=(2, 2, 2))
     grown = ps.copy()
@@ -169,7 +169,7 @@ def test_a_step_from_the_truth_goes_nowhere(roads):
 @pytest.mark.parametrize("holds", [NO_HOLDS, np.array([0.0, 0.5, 0, 0, 0, 2.0, 1e9, 1e9])])
 def test_a_step_like_the_twin(roads, holds):
     network, buckets = roads
-    points, along = (array[::25] for array in seen(network, truth()))
+    points, along = (array[::25].copy() for array in seen(network, truth()))
     start = truth() + np.random.default_rng(1).normal(0, 0.004, 8)
     p = start.copy()
     assert fit_to_roads(p, UNIT, ORIGIN, points, along, 20.0, MIN_COS, holds, buckets)
@@ -180,7 +180,7 @@ def test_a_step_like_the_twin(roads, holds):
 
 def test_share_like_the_twin(roads):
     network, buckets = roads
-    points, along = (array[::10] for array in seen(network, truth(), false=0.3))
+    points, along = (array[::10].copy() for array in seen(network, truth(), false=0.3))
     for radius in (4.0, 15.0):
         arguments = truth(), UNIT, ORIGIN, points, along, radius, MIN_COS
         share, closeness = share_on_roads(*arguments, buckets)

@@ -37,7 +37,7 @@ def test_rings_are_drawn_like_the_twin(seed):
     draw_rings(cells, np.array([2, 0]), radii, raster, found)
     assert (found[1] == 7).all()  # it was not asked for
     for j in (0, 2):
-        assert naive.bits_of(found[j]) == naive.rings_around(*cells[j], radii, raster)
+        assert np.array_equal(naive.bits_of(found[j]), naive.rings_around(*cells[j], radii, raster))
 
 
 def test_points_are_marked_where_they_lie():
@@ -46,5 +46,5 @@ def test_points_are_marked_where_they_lie():
     out = np.zeros((4, WORDS), np.uint64)
     mark_rings(rings, bearings, along, own, 7, out)
     for s in range(4):
-        assert naive.bits_of(out[s]) == naive.marks_of(rings + s, bearings, along, own, 7, RINGS)
-    assert len(naive.bits_of(out[3])) == 3  # one came in, one went out
+        assert np.array_equal(naive.bits_of(out[s]), naive.marks_of(rings + s, bearings, along, own, 7, RINGS))
+    assert naive.bits_of(out[3]).sum() == 3  # one came in, one went out

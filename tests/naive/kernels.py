@@ -200,12 +200,13 @@ def prediction_variance(normal, p, u, v):
 
 
 def nearest_alike(x, y, radius, branches, i, ref_xy, ref_branches, J, tolerance):
-    best, where = radius, -1
-    for j in range(len(ref_xy)):
-        distance = np.hypot(*(ref_xy[j] - (x, y)))
-        if distance < best and rays_agree(branches, i, ref_branches, j, J, tolerance):
-            best, where = distance, j
-    return where, best
+    away = np.hypot(*(ref_xy - (x, y)).T)
+    for j in np.argsort(away, kind="stable"):
+        if away[j] >= radius:
+            break
+        if rays_agree(branches, i, ref_branches, j, J, tolerance):
+            return j, away[j]
+    return -1, radius
 
 
 def keep_nearest(matched, distance):
@@ -533,13 +534,14 @@ def alike(code, other, tolerance):
         return {(way + turned) % 2 for way in (0, 1) if first[1][way]}
 
     for order in permutations(other):
-        ours, theirs, near = set(), set(), True
-        for n, (first, two) in enumerate(zip(code, order, strict=True)):
-            gap = (first[0] - two[0] + UNITS // 2) % UNITS - UNITS // 2
-            near &= abs(gap) <= tolerance
-            ours |= {(n, way) for way in ways(first, 0)}
-            theirs |= {(n, way) for way in ways(two, int(first[0] - gap != two[0]))}
-        if near and (ours <= theirs or theirs <= ours):
+        pairs = list(zip(code, order, strict=True))
+        gaps = [(first[0] - two[0] + UNITS // 2) % UNITS - UNITS // 2 for first, two in pairs]
+        if max(map(abs, gaps)) > tolerance:
+            continue
+        ours = {(n, way) for n, (first, _) in enumerate(pairs) for way in ways(first, 0)}
+        turned = [int(first[0] - gap != two[0]) for (first, two), gap in zip(pairs, gaps, strict=True)]
+        theirs = {(n, way) for n, (_, two) in enumerate(pairs) for way in ways(two, turned[n])}
+        if ours <= theirs or theirs <= ours:
             return True
     return False
 

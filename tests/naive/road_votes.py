@@ -68,14 +68,13 @@ def hits(points, s, x, y, turn, scale, raster):
 
 
 def bits_of(words, bearings=64):
-    """Bits of the rings of one place: {(across, ring, bearing)}."""
-    n = len(words) // 2
-    return {(w >= n, w % n, b) for w, word in enumerate(words) for b in range(bearings) if int(word) >> b & 1}
+    """Bits of the rings of one place, (2, rings, bearings): roads along the ring's radius, and across."""
+    return (words.reshape(2, -1, 1) >> np.arange(bearings, dtype=np.uint64) & np.uint64(1)).astype(bool)
 
 
 def rings_around(x, y, radii, raster, bearings=64):
-    """Bits of all rings around a place: {(across, ring, bearing)}."""
-    found = set()
+    """Bits of all rings around a place."""
+    found = np.zeros((2, len(radii), bearings), bool)
     for r, radius in enumerate(radii):
         for b in range(bearings):
             bearing = 2 * math.pi * (b + 0.5) / bearings
@@ -86,27 +85,24 @@ def rings_around(x, y, radii, raster, bearings=64):
             for d in range(DIRECTIONS):
                 away = abs(wrapped(2 * ((d + 0.5) * math.pi / DIRECTIONS - bearing))) / 2
                 if word >> d & 1:
-                    found.add((away >= math.pi / 4, r, b))
+                    found[int(away >= math.pi / 4), r, b] = True
     return found
 
 
 def marks_of(rings, bearings, along, own, first_own, n_rings, n_bearings=64):
-    """Bits of road points around an intersection: {(across, ring, bearing)}."""
-    found = set()
+    """Bits of road points around an intersection."""
+    found = np.zeros((2, n_rings, n_bearings), bool)
     for r, bearing, runs_along, branch in zip(rings, bearings, along, own, strict=True):
         if 0 <= r < n_rings and not (branch and r < first_own):
-            found.add((not runs_along, int(r), math.floor(bearing / (2 * math.pi) * n_bearings) % n_bearings))
+            found[int(not runs_along), r, math.floor(bearing / (2 * math.pi) * n_bearings) % n_bearings] = True
     return found
 
 
-def beyond_chance(points, roads, turn, bearings=64):
+def beyond_chance(points, roads, turn):
     """How many points meet roads when they are turned, beyond those of all turns, in standard deviations."""
-    met = len({(across, r, (b + turn) % bearings) for across, r, b in points} & roads)
-    dense = {}
-    for across, r, _ in roads:
-        dense[across, r] = dense.get((across, r), 0) + 1 / bearings
-    expected = sum(dense.get((across, r), 0) for across, r, _ in points)
-    return (met - expected) / math.sqrt(max(expected * (1 - expected / len(points)), 1))
+    met = (np.roll(points, turn, axis=2) & roads).sum()
+    expected = (points * roads.mean(axis=2, keepdims=True)).sum()
+    return (met - expected) / math.sqrt(max(expected * (1 - expected / points.sum()), 1))
 
 
 def ratio(met, hit_rate, rate):

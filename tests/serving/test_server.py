@@ -1,5 +1,6 @@
 """The server over real sockets, with workers that answer at once, slowly, or not."""
 
+import asyncio
 import errno
 import gzip
 import http.client
@@ -35,6 +36,14 @@ PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
 REFUSED = Location("photo.png", "not_located", "hardly a road", content=Content((60, 40)))
 SEEN_ROADS = ProbabilityMap(np.full((40, 60), 9, np.uint8))
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch):
+    """Uvicorn looks every 0.1 s whether it should end, and gives connections as long to close: here a tenth of that."""
+    swift = SimpleNamespace(**{**vars(asyncio), "sleep": lambda seconds: asyncio.sleep(seconds / 10)})
+    monkeypatch.setattr("uvicorn.server.asyncio", swift)
+    monkeypatch.setattr("roadgeo.serving.guard._GUESS_S", 0.1)
 
 
 class Workers:
@@ -102,7 +111,7 @@ def wait_until(happens):
     raise AssertionError("it has not happened")
 
 
-def send_raw(server, data, wait_s=5.0):
+def send_raw(server, data, wait_s=5.0, quiet_s=0.4):
     """All that is answered, until nothing more comes for a while."""
     answer = b""
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=wait_s) as sock:
@@ -110,7 +119,7 @@ def send_raw(server, data, wait_s=5.0):
         with suppress(TimeoutError, ConnectionResetError):
             while part := sock.recv(65536):
                 answer += part
-                sock.settimeout(0.4)
+                sock.settimeout(quiet_s)
     return answer
 
 
@@ -173,14 +182,15 @@ def test_an_origin_is_of_the_scheme_too():
             assert ask(server, "POST", "/locate", PNG, origin)[0].status == status
 
 
-def test_guesses_at_the_token_are_answered_one_after_another():
+def test_guesses_at_the_token_are_answered_one_after_another(monkeypatch):
+    monkeypatch.setattr("roadgeo.serving.guard._GUESS_S", 0.25)
     with serving(token="open sesame") as server, ThreadPoolExecutor(4) as threads:
         started = time.monotonic()
         guesses = [threads.submit(ask, server, "POST", "/session", b"guess") for _ in range(4)]
         assert ask(server, "POST", "/session", b"open sesame")[0].status == 200
-        assert time.monotonic() - started < 1.5
+        assert time.monotonic() - started < 0.75
         assert {guess.result()[0].status for guess in guesses} == {401}
-        assert time.monotonic() - started > 1.9
+        assert time.monotonic() - started > 0.95
 
 
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
@@ -208,8 +218,8 @@ POST = b"POST /locate HTTP/1.1\r\nHost: localhost\r\n"
     ],
 )
 def test_heads_that_are_none_get_an_answer_and_the_next_is_served(head, status):
-    with serving(max_bytes=1000, body_s=1.0) as server:
-        assert status in send_raw(server, head, 3.0)[:60]
+    with serving(max_bytes=1000, body_s=0.5) as server:
+        assert status in send_raw(server, head, 3.0, quiet_s=0.02)[:60]
         assert ask(server, "GET", "/health")[0].status == 200
 
 
