@@ -85,7 +85,7 @@ def warmed(network):
 @pytest.mark.parametrize("place", ["lattice", "town"])
 def test_the_time_limit_holds(request, place, name):
     reference = request.getfixturevalue(place)
-    options = LocateOptions(search=SearchOptions(time_limit_s=0.4))
+    options = LocateOptions(search=SearchOptions(time_limit_s=0.2))
     mask = RoadMask(MASKS[name]() > 0)
     started = time.process_time()  # what others do on this machine does not count
     location = locate(mask, reference, options)

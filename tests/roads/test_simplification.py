@@ -361,7 +361,7 @@ def test_runs_are_tied_at_their_ends(mates, least):
     n = len(mates)
     starts = np.array([0, n, 2 * n, 3 * n])
     lengths = np.full(3, 10.0 * (n - 1))
-    edge = np.repeat(np.arange(3), n)
+    edge = np.repeat(np.arange(3, dtype=np.int32), n)
     mate = np.full(3 * n, -1)
     mate[:n] = [-1 if m is None else m * n + k for k, m in enumerate(mates)]
     ties = parallel_roads.tie_runs(starts, lengths, edge, mate, np.full(3 * n, 5.0), 7.0, least)
@@ -378,7 +378,7 @@ def test_as_many_runs_as_there_are():
     """40 of them: room for 32 is made at first."""
     n = 3 * 40
     mates = [None if k % 3 == 2 else 1 for k in range(n)]
-    edge, mate = np.repeat([0, 1], n), np.full(2 * n, -1)
+    edge, mate = np.repeat(np.int32([0, 1]), n), np.full(2 * n, -1)
     mate[:n] = [-1 if m is None else n + k for k, m in enumerate(mates)]
     ties = parallel_roads.tie_runs(
         np.array([0, n, 2 * n]), np.full(2, 10.0 * (n - 1)), edge, mate, np.full(2 * n, 5.0), 7.0, 10.0
@@ -392,7 +392,7 @@ def test_a_run_ends_where_a_gap_opens():
     """Roads that part are tied where they are `split_distance` apart, not where they are out of sight."""
     apart = np.array([5.0, 5.0, 5.0, 6.0, 8.0, 9.5, 10.0])
     mate = np.array([7, 8, 9, 10, 11, 12, -1] + [-1] * 7)
-    edge = np.repeat([0, 1], 7)
+    edge = np.repeat(np.int32([0, 1]), 7)
     ties = parallel_roads.tie_runs(
         np.array([0, 7, 14]), np.full(2, 60.0), edge, mate, np.concatenate((apart, apart)), 7.0, 10.0
     )

@@ -4,10 +4,13 @@ import json
 from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from http.server import BaseHTTPRequestHandler
+from unittest import mock
 from urllib.parse import parse_qs, urlsplit
 
 import shapely
+from pyproj import database
 from support.loopback import serving
 
 from worlds.fenway import ANSWER
@@ -59,6 +62,10 @@ class FakeOsm:
     )
 
 
+#: osmnx asks anew for each area, 0.1 s a time; here few areas are asked for.
+_zones_of = cache(database.query_utm_crs_info)
+
+
 @contextmanager
 def fake_osm():
     """Run the servers; yields their `FakeOsm`."""
@@ -101,6 +108,6 @@ def fake_osm():
             state.queries.append(parse_qs(body)["data"][0])
             self.give(state.overpass, state.roads)
 
-    with serving(Handler) as server:
+    with serving(Handler) as server, mock.patch.object(database, "query_utm_crs_info", _zones_of):
         state.url = f"http://127.0.0.1:{server.server_port}"
         yield state
