@@ -21,6 +21,8 @@ _UNIT = 2.0 * math.pi / WHOLE_TURN
 #: Most turns of an intersection to another, and the difference below which two turns are the same.
 MAX_TURNS = 16
 _SAME_TURN = round(0.17 / _UNIT)
+#: A scale is tried with all rings where every second ring brings this part of the score to be beaten: half its share.
+_PROMISING = 0.25
 #: Chance rates lie no lower than this.
 _LEAST_RATE = 0.03
 
@@ -209,12 +211,17 @@ def vote(
     """
     n_scales, tried, kept = scales.shape[0], 0, 0
     n_points, points_of = np.zeros(n_scales), np.empty((n_scales, WORDS), np.int16)
+    some, share = np.empty((WORDS // 2, n_scales), np.uint64), np.zeros(n_scales)  # the points of every second ring
     for s in range(n_scales):
         for w in range(WORDS):
             points_of[s, w] = np.int16(count_bits(points[s, w]))
             n_points[s] += points_of[s, w]
-    turns, expected, per_sigma = np.empty(MAX_TURNS, np.int64), np.empty(n_scales), np.empty(n_scales)
-    roads, here = np.empty(WORDS, np.int16), np.empty(WORDS, np.uint64)
+        for v in range(WORDS // 2):
+            some[v, s] = points[s, 2 * v]
+            share[s] += points_of[s, 2 * v] / max(n_points[s], 1.0)
+    turns, here, met = np.empty(MAX_TURNS, np.int64), np.empty(WORDS, np.uint64), np.empty(n_scales, np.int64)
+    roads, expected, sigma = np.empty(WORDS, np.int16), np.empty(n_scales), np.empty(n_scales)
+    needed, inverse = np.empty(n_scales, np.int64), 1.0 / np.maximum(n_points, 1.0)
     for index in range(candidates.shape[0]):
         j = candidates[index]
         n_turns = find_turns(rays, places.directions, places.counts, j, tolerance, turns)
@@ -226,9 +233,12 @@ def vote(
             total = np.int32(0)
             for w in range(WORDS):
                 total = np.int32(total + np.int32(np.int32(points_of[s, w]) * np.int32(roads[w])))
-            expected[s] = total / BEARINGS
+            expected[s] = total * (1.0 / BEARINGS)
+        worst = votes[0, 3] if kept == votes.shape[0] else 0.0
         for s in range(n_scales):
-            per_sigma[s] = 1.0 / math.sqrt(max(expected[s] * (1.0 - expected[s] / max(n_points[s], 1.0)), 1.0))
+            sigma[s] = math.sqrt(max(expected[s] * (1.0 - expected[s] * inverse[s]), 1.0))
+            met_by_some = share[s] * expected[s] + _PROMISING * worst * sigma[s]
+            needed[s] = int(met_by_some) if n_points[s] >= least else WORDS * BEARINGS
         for t in range(n_turns):
             if abs(_wrapped(turns[t] - turn)) > max_off:
                 continue
@@ -237,7 +247,7 @@ def vote(
             for w in range(WORDS):
                 here[w] = turn_bits(places.rings[j, w], back)
             worst = votes[0, 3] if kept == votes.shape[0] else 0.0
-            best, where = _best_scale(here, points, n_points, least, expected, per_sigma, worst)
+            best, where = _best_scale(here, points, some, needed, expected, sigma, met, worst)
             if where >= 0:
                 slot = kept if kept < votes.shape[0] else 0  # the next free slot, or the worst vote's
                 kept = min(kept + 1, votes.shape[0])
@@ -251,23 +261,34 @@ def vote(
 def _best_scale(
     here: NDArray[np.uint64],
     points: UInt64s2,
-    n_points: NDArray[np.float64],
-    least: int,
+    some: NDArray[np.uint64],
+    needed: NDArray[np.int64],
     expected: NDArray[np.float64],
-    per_sigma: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    met: NDArray[np.int64],
     worst: float,
 ) -> tuple[float, int]:
-    """Return the best score above `worst` of the points on the roads `here`, and its scale; -1 if no scale has one."""
+    """Return the best score above `worst` of the points on the roads `here`, and its scale; -1 if no scale has one.
+
+    The points of every second ring, `some`, are counted first, at all scales side by side in `met`: where they are not
+    more than `needed`, the others are left out.
+    """
+    met[:] = 0
+    for v in range(0, WORDS // 2, 4):  # four at a time: the counts are written a quarter as often
+        a, b, c, d = here[2 * v], here[2 * v + 2], here[2 * v + 4], here[2 * v + 6]
+        for s in range(met.shape[0]):
+            first = count_bits(a & some[v, s]) + count_bits(b & some[v + 1, s])
+            met[s] += np.int64(first + count_bits(c & some[v + 2, s]) + count_bits(d & some[v + 3, s]))
     best, where = worst, -1
-    for s in range(points.shape[0]):
-        if n_points[s] < least:
+    for s in range(met.shape[0]):
+        if met[s] <= needed[s]:
             continue
-        met = np.uint64(0)
+        all_met = np.uint64(0)
         for w in range(WORDS):
-            met += count_bits(here[w] & points[s, w])
-        beyond = (met - expected[s]) * per_sigma[s]
-        if beyond > best:
-            best, where = beyond, s
+            all_met += count_bits(here[w] & points[s, w])
+        score = (all_met - expected[s]) / sigma[s]
+        if score > best:
+            best, where = score, s
     return best, where
 
 

@@ -81,11 +81,14 @@ def bin_segments(
 def _buckets_around(
     x: float, y: float, radius: float, grid: tuple[float, float, float], shape: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """Return the first and last column, and the first and last row, of the buckets that a circle may touch."""
+    """Return the first and last column, and the first and last row, of the buckets that a circle may touch.
+
+    Where it touches none, the last row is less than the first.
+    """
     column, row, reach = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2], radius / grid[2]
     c0, c1 = int(max(column - reach, 0.0)), int(min(column + reach, shape[0] - 1.0))
     r0, r1 = int(max(row - reach, 0.0)), int(min(row + reach, shape[1] - 1.0))
-    return c0, c1, r0, r1
+    return c0, c1, r0, r1 if c0 <= c1 else r0 - 1
 
 
 @kernel()
@@ -124,28 +127,26 @@ def nearest_road(
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return np.inf, fx, fy, ux, uy
     c0, c1, r0, r1 = _buckets_around(x, y, radius, grid, shape)
-    for r in range(r0, r1 + 1):
-        for c in range(c0, c1 + 1):
-            bucket = r * shape[0] + c
-            for e in range(starts[bucket], starts[bucket + 1]):
-                s = ids[e]
-                ax, ay = segments[s, 0], segments[s, 1]
-                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
-                square = sx * sx + sy * sy
-                across = (x - ax) * sy - (y - ay) * sx
-                if across * across > best * square:  # as most are: too far from the line, found without a division
+    for first in range(r0 * shape[0] + c0, r1 * shape[0] + c0 + 1, shape[0]):  # the buckets of a row lie side by side
+        for e in range(starts[first], starts[first + c1 - c0 + 1]):
+            s = ids[e]
+            ax, ay = segments[s, 0], segments[s, 1]
+            sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
+            square = sx * sx + sy * sy
+            across = (x - ax) * sy - (y - ay) * sx
+            if across * across > best * square:  # as most are: too far from the line, found without a division
+                continue
+            t = ((x - ax) * sx + (y - ay) * sy) / square if square > 0.0 else 0.0
+            t = min(max(t, 0.0), 1.0)
+            ex, ey = ax + t * sx - x, ay + t * sy - y
+            d = ex * ex + ey * ey
+            if d < best:
+                length = math.sqrt(square)
+                if length == 0.0 or abs(sx * dx + sy * dy) < min_cos * length:
                     continue
-                t = ((x - ax) * sx + (y - ay) * sy) / square if square > 0.0 else 0.0
-                t = min(max(t, 0.0), 1.0)
-                ex, ey = ax + t * sx - x, ay + t * sy - y
-                d = ex * ex + ey * ey
-                if d < best:
-                    length = math.sqrt(square)
-                    if length == 0.0 or abs(sx * dx + sy * dy) < min_cos * length:
-                        continue
-                    best = d
-                    found = True
-                    fx, fy, ux, uy = ax + t * sx, ay + t * sy, sx / length, sy / length
+                best = d
+                found = True
+                fx, fy, ux, uy = ax + t * sx, ay + t * sy, sx / length, sy / length
     if not found:
         return np.inf, fx, fy, ux, uy
     return math.sqrt(best), fx, fy, ux, uy
@@ -247,23 +248,21 @@ def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos:
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return False
     c0, c1, r0, r1 = _buckets_around(x, y, radius, grid, shape)
-    for r in range(r0, r1 + 1):
-        for c in range(c0, c1 + 1):
-            bucket = r * shape[0] + c
-            for e in range(starts[bucket], starts[bucket + 1]):
-                s = ids[e]
-                ax, ay = segments[s, 0], segments[s, 1]
-                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
-                square = sx * sx + sy * sy
-                across = (x - ax) * sy - (y - ay) * sx
-                if across * across > radius * radius * square or square == 0.0:
-                    continue
-                if abs(sx * dx + sy * dy) < min_cos * math.sqrt(square):
-                    continue
-                t = min(max(((x - ax) * sx + (y - ay) * sy) / square, 0.0), 1.0)
-                ex, ey = ax + t * sx - x, ay + t * sy - y
-                if ex * ex + ey * ey < radius * radius:
-                    return True
+    for first in range(r0 * shape[0] + c0, r1 * shape[0] + c0 + 1, shape[0]):  # the buckets of a row lie side by side
+        for e in range(starts[first], starts[first + c1 - c0 + 1]):
+            s = ids[e]
+            ax, ay = segments[s, 0], segments[s, 1]
+            sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
+            square = sx * sx + sy * sy
+            across = (x - ax) * sy - (y - ay) * sx
+            if across * across > radius * radius * square or square == 0.0:
+                continue
+            if abs(sx * dx + sy * dy) < min_cos * math.sqrt(square):
+                continue
+            t = min(max(((x - ax) * sx + (y - ay) * sy) / square, 0.0), 1.0)
+            ex, ey = ax + t * sx - x, ay + t * sy - y
+            if ex * ex + ey * ey < radius * radius:
+                return True
     return False
 
 

@@ -134,13 +134,12 @@ class TripleEstimator:
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
         self._n_rounds, self._n_by_roads, self._anchors, self._fitted_s = 0, 0, set[int](), 0.0
         sweeps.members.append(self)
-        self.in_company = False  # whether it is searched with others first, by triples, and then alone
+        self.in_company = False  # whether it is searched with others, by triples
+        self.by_unit = False  # whether each unit is searched alone then, by roads
 
     def leave_company(self) -> None:
         """Go on as if no other part were searched; the places that were verified stay known."""
-        self.in_company, self.proposed, self.ledger = False, None, Ledger(len(self.index))
-        self.sweeps = SharedSweeps(self.scene, self.options.camera, self.sweeps.ahead, alone=True)
-        self.sweeps.members.append(self)
+        self.in_company, self.by_unit, self.proposed, self.ledger = False, True, None, Ledger(len(self.index))
 
     @cached_property
     def units(self) -> IntArray:
@@ -150,15 +149,16 @@ class TripleEstimator:
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
-        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do, too, where
-        units are searched alone: triples were looked up on all of them together, and take half as long again.
+        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. Where units are
+        searched alone only roads propose: triples were looked up on all of them together.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         stages = [self.sweeps.rounds(self, source) for source in sources]
-        if by_roads and not self.in_company:
-            roads_first = self.sweeps.alone or self.index.coarseness > 1.0
-            stages.insert(0 if roads_first else len(stages), self._rounds_of_roads())
+        if self.by_unit:
+            stages = [self._rounds_of_roads()]
+        elif by_roads and not self.in_company:
+            stages.insert(0 if self.index.coarseness > 1.0 else len(stages), self._rounds_of_roads())
         if self.proposed is not None:
             yield iter([self.proposed])
         yield from stages
@@ -202,7 +202,7 @@ class TripleEstimator:
     def _votes_of_roads(self) -> Iterator[list[RoadRound]]:
         """Yield the rounds of an anchor: one, or one of each unit, where the map is searched alone."""
         args = self.scene, self.index, self.options.camera, self.near, self.sweeps.ahead
-        if not self.sweeps.alone:
+        if not self.by_unit:
             searches = [RoadSearch(*args)]
         else:
             units = (np.flatnonzero(self.units == unit) for unit in range(n_units(len(self.index))))
@@ -229,9 +229,7 @@ class TripleEstimator:
 
     def enough(self) -> bool:
         """Return whether the limit of screened places, for a map as large as all parts together, is reached."""
-        n = self.ledger.n_reference
-        larger_by = n_units(n) if self.sweeps.alone else larger(n)
-        return self.ledger.tried["triples"] >= int(self.options.max_places * larger_by)
+        return self.ledger.tried["triples"] >= int(self.options.max_places * larger(self.ledger.n_reference))
 
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""

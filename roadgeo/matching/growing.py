@@ -105,10 +105,6 @@ class Member(Protocol):
     index: ReferenceIndex
     whole: list[Place]  # that fit the whole frame
 
-    @property
-    def units(self) -> IntArray:
-        """The unit (N,) of each intersection of the map."""
-
     def allow(self, proposals: Proposals) -> BoolArray:
         """Return which proposals (M,) the hints allow."""
 
@@ -135,9 +131,9 @@ class SharedSweeps:
         The parts; all must join before the first takes a place.
     """
 
-    def __init__(self, scene: Scene, camera: CameraOptions, ahead: Ahead = ALONE, alone: bool = False) -> None:
-        """Begin without parts; `alone`: of one, each unit of which has all of the bounds (see `cut_to_units`)."""
-        self.scene, self.camera, self.ahead, self.alone = scene, camera, ahead, alone
+    def __init__(self, scene: Scene, camera: CameraOptions, ahead: Ahead = ALONE) -> None:
+        """Begin without parts."""
+        self.scene, self.camera, self.ahead = scene, camera, ahead
         self.members: list[Member] = []
         self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
         self._done: dict[int, list[_Grown]] = {}
@@ -168,8 +164,6 @@ class SharedSweeps:
         if self.members[0].enough():
             return
         indexes = [member.index for member in self.members]
-        if self.alone:
-            sweep = sweep.of_each_unit(len(indexes[0]))
         for proposals in sweep.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio, self.ahead):
             if self.members[0].enough():
                 return
@@ -177,17 +171,8 @@ class SharedSweeps:
 
     def _grow(self, proposals: Sequence[Proposals]) -> _Grown:
         """Grow an anchor's proposals on all parts; return the best places that grew, by the part's identity."""
-        allowed = [member.allow(own) for member, own in zip(self.members, proposals, strict=True)]
-        if not self.alone:
-            return self._grow_best(proposals, allowed)
-        member, units, places = self.members[0], self.members[0].units[proposals[0].reference], list[Place]()
-        for unit in np.unique(units[allowed[0]]).tolist():
-            places += self._grow_best(proposals, [allowed[0] & (units == unit)]).get(id(member), [])
-        return {id(member): places}
-
-    def _grow_best(self, proposals: Sequence[Proposals], allowed: Sequence[BoolArray]) -> _Grown:
-        """Grow the allowed proposals, within the bounds of an anchor."""
         members = self.members
+        allowed = [member.allow(own) for member, own in zip(members, proposals, strict=True)]
         # The best placed are screened ...
         placed = [own.placed[may] for own, may in zip(proposals, allowed, strict=True)]
         kept = [

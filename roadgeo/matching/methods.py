@@ -193,7 +193,8 @@ def _search(
     rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, rivals)
     sweeps.end()
-    if units > 1 and not any(search.stopped in ("accepted", "time") for search in estimators):
+    ended = any(search.stopped in ("accepted", "time") for search in estimators)
+    if units > 1 and options.effort == "full" and not ended:
         left, scale = left - (time.perf_counter() - started), float(units)
         rivals = _search_alone(together, options, ledger, left, ahead, say)
     searches = iter(rivals.estimators)
@@ -217,8 +218,7 @@ def _search_alone(
     """
     for estimator in estimators:
         estimator.leave_company()
-    if options.effort == "full":  # roads propose first
-        list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
+    list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
     searches = {Search(estimator): estimator for estimator in estimators}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
     usual = replace(options.search, time_limit_s=time_limit_s)
@@ -227,8 +227,6 @@ def _search_alone(
         for search, estimator in searches.items()
     }
     search_each(limits, rivals.stands, rivals.promise, _name_maps(searches, say))
-    for estimator in estimators:
-        estimator.sweeps.end()
     return rivals
 
 

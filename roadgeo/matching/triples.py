@@ -223,12 +223,6 @@ class Sweep:
     max_anchors: int
     most_more: float = 3.0
 
-    def of_each_unit(self, n_reference: int) -> Sweep:
-        """Return the sweep with bounds that grow with the units of a map, not with their root."""
-        more, triples = n_units(n_reference) / larger(n_reference), self.triples
-        hits, compared = int(more * triples.max_hits), int(more * triples.max_compared)
-        return replace(self, triples=replace(triples, max_hits=hits, max_compared=compared)) if more > 1.0 else self
-
     def proposals(
         self,
         scene: Scene,

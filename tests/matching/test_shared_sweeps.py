@@ -191,29 +191,6 @@ def test_a_large_map_is_cut_to_compact_units_of_a_citys_size(n, units):
     assert max(float(np.ptp(xy[unit == k], axis=0).max()) for k in range(units)) <= 1.2 * 3000.0 / units**0.5
 
 
-def test_each_unit_of_a_part_alone_has_all_of_the_bounds(monkeypatch):
-    monkeypatch.setattr(growing, "MAX_SCREENED", 4)
-    monkeypatch.setattr(growing, "MAX_VERIFIED", 2)
-    part = Part([[9, 8, 7, 6, 5, 4]])
-    part.units = np.array([0, 0, 0, 0, 0, 1])  # of the map's intersections, one for each proposal
-    seen = []
-    part.screen = lambda _, allowed, most: (seen.append(most), np.flatnonzero(allowed)[:most])[1]
-    sweeps = SharedSweeps(None, CameraOptions(), alone=True)
-    sweeps.members.append(part)
-    sweep = Plan([part])
-    sweep.of_each_unit = lambda _: sweep
-    part.index = part.units
-    (found,) = sweeps.rounds(part, sweep)
-    assert seen == [4, 1]
-    assert supports(found) == [9.0, 8.0, 4.0]
-
-
-def test_bounds_of_triples_grow_with_the_units():
-    sweep = Sweep(TripleOptions(max_hits=100, max_compared=1000), 12)
-    assert sweep.of_each_unit(15_000) is sweep
-    assert sweep.of_each_unit(60_000).triples.bounds(60_000) == (400, 4000)
-
-
 def test_a_broken_mask_is_found_in_company_as_it_is_alone(towns):
     networks, indexes = towns
     graph = look(networks[2], TRUTH, (1000, 1000), Sight(1.0, missing=0.45, false=0.3))
@@ -234,5 +211,5 @@ def test_where_nothing_stands_out_each_map_says_when_its_turn_comes(towns):
     parts = [
         Whole(replace(index, meta={**index.meta, "name": name})) for index, name in zip(towns[1], "aabc", strict=True)
     ]
-    search_references(query, parts, LocateOptions(effort="quick"), 60.0, say=lambda text, _=None: said.append(text))
+    search_references(query, parts, LocateOptions(), 60.0, say=lambda text, _=None: said.append(text))
     assert said == [f"searching each map alone, map {k} of 3" for k in (1, 2, 3)]

@@ -98,11 +98,16 @@ def marks_of(rings, bearings, along, own, first_own, n_rings, n_bearings=64):
     return found
 
 
-def beyond_chance(points, roads, turn):
-    """How many points meet roads when they are turned, beyond those of all turns, in standard deviations."""
-    met = (np.roll(points, turn, axis=2) & roads).sum()
+def beyond_chance(points, roads, turn, least=0.0):
+    """How many points meet roads when they are turned, beyond those of all turns, in standard deviations.
+
+    0 where those of every second ring do not bring more than `least` of it, the rest being left out.
+    """
+    met = np.roll(points, turn, axis=2) & roads
     expected = (points * roads.mean(axis=2, keepdims=True)).sum()
-    return (met - expected) / math.sqrt(max(expected * (1 - expected / points.sum()), 1))
+    sigma = math.sqrt(max(expected * (1 - expected / points.sum()), 1))
+    by_some = met[:, ::2].sum() - expected * points[:, ::2].sum() / points.sum()
+    return (met.sum() - expected) / sigma if by_some > least * sigma else 0.0
 
 
 def ratio(met, hit_rate, rate):
