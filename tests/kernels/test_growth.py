@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive import kernels as naive
 
-from roadgeo.kernels.growth import grow, grow_each
+from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.point_matching import keep_nearest, match_all, nearest_alike
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
@@ -129,15 +129,18 @@ class TestGrow:
     NUMBERS = (2.0, 25.0)
     RATES = (0.4, 0.45, 0.08, 4.0)
 
-    def run(self, world, anchor, ref_anchor, seeds):
+    def run(self, world, anchor, ref_anchor, seeds, least=0):
+        """Grow one proposal; it needs so many matches."""
         order, neighbours, partners, affine = seeds
-        matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
-        matrix = np.empty((3, 3))
+        matched, matrices, ratios = np.empty((1, len(world.xy)), np.int64), np.empty((1, 3, 3)), np.empty(1)
         sigma_m, radius_m = self.NUMBERS
         limits = GrowthLimits((sigma_m, 0.0), (radius_m, 0.0), MIN_COS, *self.RATES)
         query = GrowthQuery(world.xy, world.branches, neighbours, order, 500.0, anchor)
-        result = grow(query, ref_anchor, affine, partners, world.reference, limits, matched, distance, matrix)
-        return result, matched, distance, matrix
+        grow_each(
+            query, np.array([ref_anchor]), affine[None], partners[None], world.reference, limits, least,
+            matched, matrices, ratios,
+        )  # fmt: skip
+        return ratios[0], matched[0], matrices[0]
 
     @pytest.mark.parametrize(("seed", "most"), [(0, None), (1, None), (2, None), (3, None), (1, 40), (3, 25)])
     def test_like_the_twin(self, seed, most):
@@ -148,17 +151,19 @@ class TestGrow:
                 order, neighbours, partners, affine = world.seeds(anchor)
                 order = order[:most]
                 seeds = order, neighbours, partners, affine
-                result, matched, _, matrix = self.run(world, anchor, ref_anchor, seeds)
+                ratio, matched, matrix = self.run(world, anchor, ref_anchor, seeds)
                 try:
                     expected = naive.grow(
                         world.xy, world.branches, order, 500.0, anchor, ref_anchor, affine, neighbours, partners,
                         world.ref_xy, world.ref_branches, *self.NUMBERS, TOLERANCE, *self.RATES,
                     )  # fmt: skip
                 except naive.GivenUpError:
-                    assert result[2] == -np.inf
+                    assert ratio == -np.inf
                     continue
-                ratio, *counts, matches, model = expected
-                assert result == pytest.approx((*counts, ratio))
+                expected_ratio, hits, _, matches, model = expected
+                assert ratio == pytest.approx(expected_ratio)
+                for n, is_enough in ((hits, True), (hits + 1, False)):
+                    assert (self.run(world, anchor, ref_anchor, seeds, n)[0] > -np.inf) == is_enough
                 assert np.array_equal(matched, matches)
                 assert np.allclose(matrix / matrix[2, 2], model / model[2, 2], rtol=1e-4, atol=1e-4)
 
@@ -166,10 +171,10 @@ class TestGrow:
         anchor = int(np.flatnonzero(world.truth >= 0)[0])
         order, neighbours, partners, affine = world.seeds(anchor)
         nothing = np.full_like(partners, -1)
-        assert self.run(world, anchor, 0, (order, neighbours, nothing, affine))[0] == (0, 0, -np.inf)
+        assert self.run(world, anchor, 0, (order, neighbours, nothing, affine))[0] == -np.inf
         alone = nothing.copy()
         alone[0] = 3
-        assert self.run(world, anchor, 0, (order, neighbours, alone, affine))[0] == (0, 0, -np.inf)
+        assert self.run(world, anchor, 0, (order, neighbours, alone, affine))[0] == -np.inf
 
     def test_each_proposal_grows_as_it_does_alone(self, world):
         anchor = int(np.flatnonzero(world.truth >= 0)[0])
@@ -186,8 +191,8 @@ class TestGrow:
                 matched, matrices, ratios,
             )  # fmt: skip
             for m, reference in enumerate(references):
-                (n, _, ratio), alone, _, matrix = self.run(world, anchor, reference, world.seeds(anchor))
-                assert ratios[m] == (ratio if n >= least else -np.inf)
+                ratio, alone, matrix = self.run(world, anchor, reference, world.seeds(anchor), least)
+                assert ratios[m] == ratio
                 assert np.array_equal(matched[m], alone)
                 assert ratio == -np.inf or np.array_equal(matrices[m], matrix)
             assert (least == 1) == np.isfinite(ratios).any()

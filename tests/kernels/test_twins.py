@@ -39,6 +39,7 @@ CALLS = {
     "describe_intersections": "find_intersections",
     "find_cuts": "cut_edges",
     "fit_branches": "find_intersections",
+    "grow": "grow_each",
 }
 
 #: Why a kernel has none.
@@ -51,7 +52,7 @@ REASONS = {
     "count_bits": "compared with Python's count of bits",
     "count_neighbours": "part of `fill_table`, whose twin lists the neighbours",
     "count_alike": "compared with the decoded table, counted in the test",
-    "grow_each": "compared with `grow`, which has a twin",
+    "grow_each": "calls `grow`, which has a twin, for each proposal",
     "has_both": "a test states its two cases",
     "mark_tiles": "`paint_roads` on what it marks is compared with a twin that knows no tiles",
     "measure_edges": "compared with the lengths that the graph computes",

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import sqlite3
 import struct
+from functools import cache
 from pathlib import Path
 
 import geopandas as gpd
@@ -165,6 +166,13 @@ FILES = {
 }
 
 
+@cache
+def roads_of_frame():
+    """The streets as a GeoDataFrame gives them."""
+    lines, highway, tunnel = streets()
+    return choose_roads(gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs=CRS))
+
+
 @pytest.mark.parametrize("name", ["geometry", "wkb_geometry", "shape_of_it", "WKT"])
 @pytest.mark.parametrize("shapes", SHAPES)
 @pytest.mark.parametrize("library", [*TABLES, *FILES])
@@ -180,7 +188,7 @@ def test_tables_of_any_library_give_the_same_roads(tmp_path: Path, library: str,
         found = choose_roads(tmp_path / library, crs=crs)
     else:
         found = choose_roads(TABLES[library](columns), crs=crs)
-    right = choose_roads(gpd.GeoDataFrame({"highway": highway, "tunnel": tunnel}, geometry=lines, crs=CRS))
+    right = roads_of_frame()
     assert shapely.hausdorff_distance(found.lines, right.lines).max() < 1e-6
     assert found.kinds.tolist() == right.kinds.tolist()
 
