@@ -60,6 +60,8 @@ DAILY = (
     "tests/reference/test_files.py",
     "tests/test_corpus.py",
 )
+#: A test that combines lists of parameters into more cases leaves two thirds to the night; each parameter stays.
+MOST_CASES = 24
 #: A browser, QGIS and the development data.
 NIGHTLY_FIXTURES = {"browser", "chromium", "data_dir", "qgis"}
 
@@ -96,14 +98,25 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_report_header() -> str:
-    return f"nightly (-m ''): slow ones but {', '.join(DAILY)}; {', '.join((*NIGHTLY, *sorted(NIGHTLY_FIXTURES)))}"
+    left = f"two thirds of more than {MOST_CASES} cases, slow ones but {', '.join(DAILY)}"
+    return f"nightly (-m ''): {left}; {', '.join((*NIGHTLY, *sorted(NIGHTLY_FIXTURES)))}"
 
 
-def is_nightly(item: pytest.Item, is_slow: bool) -> bool:
+def is_of_the_third(item: pytest.Item, number: int) -> bool:
+    """Whether a case is of the third that stays, in which each parameter of each list occurs, by its number."""
+    lists = [len(mark.args[1]) for mark in item.iter_markers("parametrize")]  # the last one is gone through first
+    places = []
+    for length in reversed(lists):
+        number, place = divmod(number, length)
+        places.append(place)
+    return len(lists) < 2 or sum(places) % 3 == 0
+
+
+def is_nightly(item: pytest.Item, is_slow: bool, is_left: bool) -> bool:
     """Whether a test is left out: of two beginnings that fit its name the longer one decides."""
     daily, nightly = (max(len(start) * item.nodeid.startswith(start) for start in names) for names in (DAILY, NIGHTLY))
     needs = NIGHTLY_FIXTURES.intersection(getattr(item, "fixturenames", ()))
-    return bool(needs) or nightly > daily or (is_slow and not daily)
+    return bool(needs) or nightly > daily or ((is_slow or is_left) and not daily)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -112,11 +125,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     Where several processes share the tests, files that take longest come first: none is left to one process in the end.
     """
     seconds = json.loads(SECONDS.read_text("utf-8"))
+    cases: dict[str, list[pytest.Item]] = {}
     for item in items:
-        if is_slow := item.nodeid in seconds:
-            item.add_marker(pytest.mark.slow)
-        if is_nightly(item, is_slow):
-            item.add_marker(pytest.mark.nightly)
+        cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    for test in cases.values():
+        for number, item in enumerate(test):
+            if is_slow := item.nodeid in seconds:
+                item.add_marker(pytest.mark.slow)
+            if is_nightly(item, is_slow, len(test) > MOST_CASES and not is_of_the_third(item, number)):
+                item.add_marker(pytest.mark.nightly)
     if hasattr(config, "workerinput"):
         files = Counter()
         for name, took in seconds.items():
