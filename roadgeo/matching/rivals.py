@@ -63,7 +63,8 @@ _APART, _SAME = 0.04, 0.67
 #: are not independent; where they favour different places, it counts against.
 #: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
 _AGREEING = 0.5
-#: The blocks beside a place, and the streets around it, where the lead over places near may be enough.
+#: The blocks beside a place (farther where the frame is large), and the streets around it, where the lead over places
+#: near may be enough.
 _NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
 _AROUND = replace(_NEARBY, reach_m=4000.0, n_places=LocalSearchOptions.n_places)
 
@@ -176,7 +177,7 @@ class Rivals:
             by_picture(place, picture.gsd_m) for place in ranked if math.dist(place.center, best.center) > apart_m
         ]
         likelihood, lead, rival = picture.weigh(best.matrix), math.inf, None
-        for around in (_NEARBY, _AROUND):
+        for around in _surroundings(best):
             others += _around(picture, best, around.reach_m, apart_m, estimator)
             rival = max(others, key=lambda other: other.log10_likelihood, default=None)
             lead = picture.lead(likelihood, -math.inf if rival is None else rival.log10_likelihood)
@@ -250,7 +251,7 @@ class Rivals:
         leads = compared.score >= _MAY_LEAD * self.needed
         if not leads and estimator.nearby(best) < HARDLY * own:
             return compared
-        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a neighbouring block may be the place
+        for around in _surroundings(best)[: 1 + leads]:  # a neighbouring block may be the place
             rivals += filter(is_rival, similar_places(best, compare, estimator.options, around))
             compared = scored(rivals)
             if _is_beaten(compared) or compared.score >= _CERTAIN:
@@ -266,6 +267,16 @@ class Rivals:
 
 def _is_of_map(index: ReferenceIndex, other: ReferenceIndex) -> bool:
     return index.is_of_map(other) or index.is_shard_beside(other)
+
+
+def _surroundings(place: Place) -> tuple[LocalSearchOptions, LocalSearchOptions]:
+    """Return where rivals of a place are looked for: beside it, then in the streets around.
+
+    Beside it is as far as half of the frame's diagonal at least, for in a large frame a lattice that is off by several
+    blocks still fits most roads.
+    """
+    beside_m = max(_NEARBY.reach_m, place.scene.half_size * place.gsd_m)
+    return replace(_NEARBY, reach_m=min(beside_m, _AROUND.reach_m)), _AROUND
 
 
 def _is_beaten(place: Place) -> bool:

@@ -345,8 +345,9 @@ class RoadGrower:
 #: The smallest pixels that are tried on a map of coarseness 1; a coarse map multiplies them by its coarseness.
 COARSE_PIXEL_M = 0.35
 
-#: Number of an anchor's proposals that grow, and number of grown places that are compared with the map.
-_MAX_GROWN, _MAX_KEPT = 80, 2
+#: Number of an anchor's proposals that grow, if they are at least so likely as a part of the best; and number of grown
+#: places that are compared with the map.
+_MAX_GROWN, _LIKELY, _MAX_KEPT = 80, 0.5, 2
 #: Greatest width of roads, metres: no scales are tried at which they would be wider.
 _ROAD_WIDTH_M = 75.0
 
@@ -404,7 +405,7 @@ class RoadSearch:
         xy = self.scene.intersections.xy
         anchors = islice(farthest_first(xy, np.arange(len(xy))), N_VOTING)
         for votes in self.ahead.map(self.voter.votes, anchors):
-            best = slice(_MAX_GROWN)
+            best = slice(min(int((votes.ratio >= _LIKELY * votes.ratio[:1]).sum()), _MAX_GROWN))
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
             some = sorted(grown, key=lambda place: -place.support)
             yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[:_MAX_KEPT])

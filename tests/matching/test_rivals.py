@@ -282,7 +282,7 @@ def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     assert asked.compare(item) is first
 
 
-@pytest.mark.parametrize(("certain", "farther"), [(np.inf, [(rivals._AROUND,)]), (0.0, [])])
+@pytest.mark.parametrize(("certain", "farther"), [(np.inf, [rivals._AROUND]), (0.0, [])])
 def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_that_may_be_lost(
     even, broken, monkeypatch, certain, farther
 ):
@@ -290,11 +290,22 @@ def test_streets_around_are_looked_at_only_where_the_blocks_beside_leave_a_lead_
     looked = []
     monkeypatch.setattr(rivals, "_CERTAIN", certain)
     monkeypatch.setattr(rivals, "HARDLY", 0.0)
-    monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append(reported[3:]) or [])
+    monkeypatch.setattr(rivals, "similar_places", lambda *reported: looked.append((reported[0], *reported[3:])) or [])
     monkeypatch.setattr(TripleEstimator, "look_for_equals", lambda *_: None)
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
-    assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), *farther]
+    (small, beside_small), (large, beside_large), *others = looked
+    assert beside_small == rivals._NEARBY
+    assert beside_small.reach_m > small.scene.half_size * small.gsd_m
+    assert beside_large.reach_m == large.scene.half_size * large.gsd_m > rivals._NEARBY.reach_m
+    assert [around for _, around in others] == farther
+
+
+def test_beside_a_place_is_never_farther_than_around_it(broken):
+    matrix, index, evidence = broken
+    huge = Place(evidence.scene, index, np.diag([100.0, 100.0, 1.0]) @ matrix)
+    beside_it, around = rivals._surroundings(huge)
+    assert beside_it.reach_m == around.reach_m == rivals._AROUND.reach_m
 
 
 # --- traced roads and the picture -------------------------------------------------------------------------------------

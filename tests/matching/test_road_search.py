@@ -147,6 +147,18 @@ def test_work_is_bounded(town, broken, monkeypatch):
     assert n_anchors(N_VOTING=5) == 5
 
 
+def test_proposals_far_less_likely_than_the_best_do_not_grow(town, broken, monkeypatch):
+    def first_round():
+        return next(RoadSearch(broken, town[1], CameraOptions()).rounds())
+
+    votes = RoadSearch(broken, town[1], CameraOptions()).voter.votes(first_round().anchor)
+    likely = int((votes.ratio >= 0.5 * votes.ratio[0]).sum())
+    assert 1 <= likely < 80 < len(votes.ratio)
+    assert first_round().n_proposed == likely
+    monkeypatch.setattr(road_search, "_MAX_GROWN", 3)
+    assert first_round().n_proposed == min(likely, 3)
+
+
 def test_parts_of_a_map_share_what_an_intersection_sees(town, broken):
     index = town[1]
     parts = [RoadSearch(broken, index, CameraOptions(), among=np.arange(k, len(index), 2)) for k in range(2)]
