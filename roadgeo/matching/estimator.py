@@ -135,11 +135,13 @@ class TripleEstimator:
         self._n_rounds, self._n_by_roads, self._anchors, self._fitted_s = 0, 0, set[int](), 0.0
         sweeps.members.append(self)
         self.in_company = False  # whether it is searched with others, by triples
-        self.by_unit = False  # whether each unit is searched alone then, by roads
+        self.by_unit = False  # whether it is searched alone then, each unit by roads
 
     def leave_company(self) -> None:
         """Go on as if no other part were searched; the places that were verified stay known."""
         self.in_company, self.by_unit, self.proposed, self.ledger = False, True, None, Ledger(len(self.index))
+        self.sweeps = SharedSweeps(self.scene, self.options.camera, self.sweeps.ahead)
+        self.sweeps.members.append(self)
 
     @cached_property
     def units(self) -> IntArray:
@@ -149,16 +151,15 @@ class TripleEstimator:
     def stages(self) -> Iterator[Iterator[list[Place]]]:
         """Yield the places that were proposed before, then those that grew from each anchor; triples before roads.
 
-        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. Where units are
-        searched alone only roads propose: triples were looked up on all of them together.
+        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it. They do, too, where
+        maps are searched alone: triples were looked up on all of them together.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         stages = [self.sweeps.rounds(self, source) for source in sources]
-        if self.by_unit:
-            stages = [self._rounds_of_roads()]
-        elif by_roads and not self.in_company:
-            stages.insert(0 if self.index.coarseness > 1.0 else len(stages), self._rounds_of_roads())
+        if by_roads and not self.in_company:
+            roads_first = self.by_unit or self.index.coarseness > 1.0
+            stages.insert(0 if roads_first else len(stages), self._rounds_of_roads())
         if self.proposed is not None:
             yield iter([self.proposed])
         yield from stages

@@ -226,7 +226,9 @@ def _search_alone(
         search: replace(usual, work_limit_s=usual.work_limit_s * n_units(len(estimator.index)))
         for search, estimator in searches.items()
     }
-    search_each(limits, rivals.stands, rivals.promise, _name_maps(searches, say))
+    search_each(limits, rivals.stands, rivals.promise, rivals.may_go_on, _name_maps(searches, say))
+    for estimator in estimators:
+        estimator.sweeps.end()
     return rivals
 
 

@@ -127,6 +127,10 @@ class Rivals:
         most = max((place.log10_likelihood for place in self.estimators[part].verified), default=0.0)
         return most / max(self.needed, 1.0)  # of a user who asks for less
 
+    def may_go_on(self, part: Search[Place]) -> bool:
+        """Return whether a part may do its next stage: no place on another part explains more."""
+        return 0.0 < self.promise(part) == max(map(self.promise, self.estimators))
+
     def _rivals(self, part: Search[Place], best: Place) -> bool:
         """Return whether another part has another place that explains nearly as much as the best place of all."""
         least = best.explained - self.needed * best.statement_px

@@ -188,14 +188,15 @@ def search_each(
     parts: Mapping[Search[Model], SearchOptions],
     proves: Callable[[Search[Model]], bool],
     promise: Callable[[Search[Model]], float],
+    may_go_on: Callable[[Search[Model]], bool] = lambda _: True,
     heard: Callable[[Search[Model]], None] = lambda _: None,
 ) -> None:
     """Search each part as if it were alone, within its own limits, until the answer of one stands out.
 
     Parts share the work as 10 to the power of their `promise`, a log10: a small map does not wait for large ones, and
     where an answer shows, its map is searched first. `proves` returns whether a part has the answer. It is called when
-    the best model reaches `SearchOptions.accept`, and at the end of each stage. `heard` is called with each part before
-    its round.
+    the best model reaches `SearchOptions.accept`, and at the end of each stage. A part ends after a
+    stage unless it `may_go_on`. `heard` is called with each part before its round.
     """
     budgets = {part: _Budget(options) for part, options in parts.items()}
     done = dict.fromkeys(parts, -math.inf)  # log10 of the work done, less the promise
@@ -204,7 +205,8 @@ def search_each(
         stage = part.stage
         heard(part)
         part.advance(budgets[part])
-        part.stopped = budgets[part].spent or ("exhausted" if part.ended else "")
+        ended = part.ended or (part.stage > stage and not may_go_on(part))
+        part.stopped = budgets[part].spent or ("exhausted" if ended else "")
         if (part.score >= parts[part].accept or part.stage > stage or part.stopped) and proves(part):
             part.stopped = "accepted"
         if part.stopped in ("accepted", "time"):

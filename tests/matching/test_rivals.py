@@ -273,6 +273,17 @@ def test_a_map_that_was_searched_to_its_end_needs_no_double_lead(broken, monkeyp
     assert asked.stands(item) == stands
 
 
+def test_the_part_goes_on_whose_place_explains_most(broken, monkeypatch):
+    pairs = [search_of(broken, broken[0]) for _ in range(3)]
+    asked = Rivals(dict(pairs), Ledger(n_reference=866), NEEDED)
+    for (_, estimator), likelihood in zip(pairs, (100.0, 99.0, 1.0), strict=True):
+        estimator.verified = [estimator.verified[0].but(by=Weight(likelihood, 1.0))]
+    assert [asked.may_go_on(part) for part, _ in pairs] == [True, False, False]
+    for _, estimator in pairs:
+        estimator.verified = []
+    assert not any(asked.may_go_on(part) for part, _ in pairs)  # nothing promises anything
+
+
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     item, estimator = search_of(broken, broken[0])
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)

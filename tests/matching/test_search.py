@@ -161,10 +161,10 @@ def test_work_that_was_done_together_is_not_charged_again():
 # --- each part as if it were alone ------------------------------------------------------------------------------------
 
 
-def each(*toys, options=None, promise=lambda part: 0.0, heard=lambda part: None):
+def each(*toys, options=None, promise=lambda part: 0.0, may_go_on=lambda part: True, heard=lambda part: None):
     parts = [Search(toy) for toy in toys]
     limits = dict.fromkeys(parts, options or SearchOptions(work_limit_s=1e9))
-    search_each(limits, lambda part: part.score >= 8.0, promise, heard)
+    search_each(limits, lambda part: part.score >= 8.0, promise, may_go_on, heard)
     return parts
 
 
@@ -192,6 +192,13 @@ def test_work_is_shared_as_ten_to_the_power_of_the_promise():
     promise = {id(toy): float(n > 0) for n, toy in enumerate(toys)}
     each(*toys, promise=lambda part: promise[id(part.estimator)])
     assert [len(toy.scored) for toy in toys] == pytest.approx([20, 200, 201], abs=1)
+
+
+def test_a_part_does_its_next_stage_only_if_it_may():
+    toys = [InStages([[(10 * n, 1.0)], [(10 * n + 1, 9.0)]]) for n in range(2)]
+    parts = each(*toys, may_go_on=lambda part: part.estimator is toys[1])
+    assert [toy.scored for toy in toys] == [[0], [10, 11]]
+    assert [part.stopped for part in parts] == ["exhausted", "accepted"]
 
 
 def test_each_part_has_its_own_limit_of_work():
