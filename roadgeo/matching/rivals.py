@@ -37,7 +37,7 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import SAME_M, Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
-__all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "similar_places"]
+__all__ = ["N_LIKELIEST", "Compared", "Rivals", "fitted", "log10_gap", "places_beside", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when turned by a right angle.
 _TURNS_DEG = tuple(90.0 * k for k in range(4))
@@ -329,6 +329,12 @@ def similar_places(
     roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
     finely = (fitted(other.place, match, None) for other in roughly[:N_CLOSELY])
     return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[N_CLOSELY:]]
+
+
+def places_beside(place: Place, match: MatchOptions) -> list[Place]:
+    """Return the other places beside a place, whatever hints allow."""
+    beside, _ = _surroundings(place)
+    return [other.place for other in similar_places(place, place.evidence.compared_with(place.matrix), match, beside)]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:

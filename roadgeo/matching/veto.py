@@ -21,6 +21,7 @@ from roadgeo.matching.methods import Searched, may_show, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Part
 from roadgeo.matching.place import Place, Weight
+from roadgeo.matching.rivals import places_beside
 from roadgeo.matching.scene import Query
 
 __all__ = ["broken_hints", "contest", "without_hints"]
@@ -49,7 +50,8 @@ def contest(
 ) -> list[Searched]:
     """Return what a search with hints found; with the place where the roads fit better without them, if there is one.
 
-    Where the search with hints found a place that would be reported, any other that explains more is a better one.
+    Where the search with hints found a place that would be reported, any other that explains more is a better one: one
+    that the search without them met, or one beside it, for in a lattice that search may lead nowhere.
     Where it did not, only a place that would be reported itself is. A better place that agrees with the hints is the
     answer: the places found without them.
     """
@@ -65,7 +67,9 @@ def contest(
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
     results = search_references(query, here, free, time_limit_s)
     others = [place for result in results for place in (result.likeliest if is_reported else result.places[:1])]
-    if not is_reported:
+    if is_reported:
+        others += [place for place in places_beside(leading.places[0], free.match) if broken_hints(place, options)]
+    else:
         others = [place for place in others if place.score >= needed]
     better = _better(leading.places[0] if leading.places else None, others)
     if better is not None and not broken_hints(better, options):  # hints led past it

@@ -75,6 +75,17 @@ def test_a_place_that_is_told_falsely_is_refused_and_the_refusal_says_where_the_
     assert np.allclose(location.places[0].center[2:], best.lonlat, atol=1e-5)
 
 
+def test_where_the_search_without_hints_finds_nothing_the_blocks_beside_may_still_fit_better(town, monkeypatch):
+    """As in a lattice, in which a place must lead many others to be found."""
+    query, index = town
+    options = hinted(town, 300.0)
+    (best, *_) = found(town, options)
+    monkeypatch.setattr(veto, "search_references", lambda *_: [Searched(index)])
+    wrong = Place(query.scene, index, shifted(best.matrix, 300.0, 0.0)).but(refined=best.refined, score=9.0)
+    assert answer(town, options, [wrong]).reason_code is Reason.FITS_ELSEWHERE
+    assert answer(town, hinted(town), [best]).located
+
+
 @pytest.mark.parametrize(
     ("score", "near_m", "where"),
     [
