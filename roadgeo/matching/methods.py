@@ -28,7 +28,7 @@ from roadgeo.matching.parts import Part, Whole
 from roadgeo.matching.picture import by_picture
 from roadgeo.matching.place import Place, Weight
 from roadgeo.matching.rivals import N_LIKELIEST, Rivals
-from roadgeo.matching.road_search import COARSE_PIXEL_M, make_raster
+from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.scene import Query
 from roadgeo.matching.search import Ahead, Search, search_each, search_together
 from roadgeo.matching.triples import larger, n_units
@@ -196,10 +196,10 @@ def _search(
     ended = any(search.stopped in ("accepted", "time") for search in estimators)
     if units > 1 and options.effort == "full" and not ended:
         left, scale = left - (time.perf_counter() - started), float(units)
-        rivals = _search_alone(together, options, ledger, left, ahead, say)
-    searches = iter(rivals.estimators)
+        rivals = _search_alone(together, options, ledger, left, say)
+    compared = iter(rivals.compare_all())
     return [
-        result if result.estimator is None else _end(result, result.estimator, next(searches), rivals, scale)
+        result if result.estimator is None else _end(result, result.estimator, *next(compared), rivals.needed, scale)
         for result in begun
     ]
 
@@ -209,7 +209,6 @@ def _search_alone(
     options: LocateOptions,
     ledger: Ledger,
     time_limit_s: float,
-    ahead: Ahead,
     say: Say,
 ) -> Rivals:
     """Search each part, and each unit of it, as if it were alone: leads compete, each on its own part.
@@ -218,7 +217,6 @@ def _search_alone(
     """
     for estimator in estimators:
         estimator.leave_company()
-    list(ahead.map(make_raster, [estimator.index for estimator in estimators]))
     searches = {Search(estimator): estimator for estimator in estimators}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
     usual = replace(options.search, time_limit_s=time_limit_s)
@@ -272,15 +270,21 @@ def _begin(sweeps: SharedSweeps, index: ReferenceIndex, options: LocateOptions, 
     return Searched(index, counts=Counter(searched=len(part)), events=events, estimator=estimator)
 
 
-def _end(begun: Searched, estimator: TripleEstimator, search: Search[Place], rivals: Rivals, scale: float) -> Searched:
+def _end(
+    begun: Searched,
+    estimator: TripleEstimator,
+    search: Search[Place],
+    best: Place | None,
+    needed: float,
+    scale: float,
+) -> Searched:
     """Return the result with its places; work is divided by `scale`, as on a map of usual size."""
-    best = rivals.compare(search)
     work_ms = round(1000 * estimator.work / scale)
     counts = estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified
     kept = begun.events.kept
     return replace(
         begun,
-        places=() if best is None or best.refined is None else _listed(estimator, best, rivals.needed),
+        places=() if best is None or best.refined is None else _listed(estimator, best, needed),
         likeliest=tuple(sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]),
         stopped=search.stopped,
         counts=begun.counts + Counter(tried=estimator.n_screened, anchors=estimator.n_anchors),

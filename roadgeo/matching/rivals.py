@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
@@ -98,6 +98,7 @@ class Rivals:
         self._deadline = time.perf_counter() + time_limit_s
         self._compared: dict[tuple[Place, ...], Place] = {}  # by the place and those that were met
         self._pictured: dict[tuple[Place, ...], Place] = {}  # by the place by roads and those that were verified
+        self._similar: dict[tuple[Place, LocalSearchOptions], list[Compared]] = {}  # by the place, and how far around
 
     def __call__(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
         """Return the part whose likeliest place leads all others by twice the score needed, or None."""
@@ -107,7 +108,8 @@ class Rivals:
         place = self._among_equals(best)
         if place is None or place.score < 2.0 * self.needed:
             return None
-        return None if any(self._rivals(part, place) for part in parts if part is not best) else best
+        others = (self.estimators[part].verified for part in parts if part is not best)
+        return None if any(self._are_near(place, verified) for verified in others) else best
 
     def stands(self, part: Search[Place]) -> bool:
         """Return whether a part of a map that is searched alone has the answer.
@@ -131,13 +133,34 @@ class Rivals:
         """Return whether a part may do its next stage: no place on another part explains more."""
         return 0.0 < self.promise(part) == max(map(self.promise, self.estimators))
 
-    def _rivals(self, part: Search[Place], best: Place) -> bool:
-        """Return whether another part has another place that explains nearly as much as the best place of all."""
+    def _are_near(self, best: Place, others: Iterable[Place]) -> bool:
+        """Return whether another place of another part explains nearly as much as the best place of all."""
         least = best.explained - self.needed * best.statement_px
-        return any(other.explained > least and not other.same(best) for other in self.estimators[part].verified)
+        return any(other.explained > least and not other.same(best) for other in others)
 
     def _explained(self, part: Search[Place]) -> float:
         return max((place.explained for place in self.estimators[part].verified), default=-math.inf)
+
+    def compare_all(self) -> Iterator[tuple[Search[Place], Place | None]]:
+        """Yield each part with its likeliest place, scored against its best rival; None if no place was verified.
+
+        Where the place of one part has ended the search, the places of a part that explain far less than it, by roads
+        and by the picture, are not compared: the part has None.
+        """
+        accepted = next((part for part in self.estimators if part.stopped == "accepted"), None)
+        best = None if accepted is None else self.compare(accepted)
+        for part in self.estimators:
+            yield part, best if part is accepted else self.compare(part) if self._may_matter(part, best) else None
+
+    def _may_matter(self, part: Search[Place], best: Place | None) -> bool:
+        """Return whether a part has a place that explains nearly as much, by roads or by the picture."""
+        others = _likeliest(self.estimators[part])
+        if best is None or self._are_near(best.but(by=None), others):
+            return True
+        if best.scene.probability is None:
+            return False
+        pictured, *others = (by_picture(place, best.gsd_m) for place in [best, *others[:N_LIKELIEST]])
+        return self._are_near(pictured, others)
 
     def compare(self, part: Search[Place]) -> Place | None:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
@@ -163,7 +186,7 @@ class Rivals:
 
         A rival that leads by less than the score needed is not located either: it leads the place by no more.
         """
-        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)[:N_LIKELIEST]
+        ranked = _likeliest(estimator)[:N_LIKELIEST]
         gsd_m = ranked[0].gsd_m
         best = max(ranked, key=lambda place: by_picture(place, gsd_m).log10_likelihood)
         for _ in range(N_LIKELIEST):
@@ -202,7 +225,7 @@ class Rivals:
     def _by_roads(self, part: Search[Place]) -> Place | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""
         estimator = self.estimators[part]
-        ranked = sorted(estimator.verified, key=lambda place: -place.log10_likelihood)
+        ranked = _likeliest(estimator)
         if not ranked:
             return None
         started = time.perf_counter()
@@ -256,7 +279,10 @@ class Rivals:
         if not leads and estimator.nearby(best) < HARDLY * own:
             return compared
         for around in _surroundings(best)[: 1 + leads]:  # a neighbouring block may be the place
-            rivals += filter(is_rival, similar_places(best, compare, estimator.options, around))
+            key = best, around
+            if key not in self._similar:
+                self._similar[key] = similar_places(best, compare, estimator.options, around)
+            rivals += filter(is_rival, self._similar[key])
             compared = scored(rivals)
             if _is_beaten(compared) or compared.score >= _CERTAIN:
                 break
@@ -267,6 +293,11 @@ class Rivals:
         matrix = rival.matrix  # type: ignore[union-attr]
         verified = next((place for place in ranked if place.matrix is matrix), None)
         return verified or estimator.settle(Place(estimator.scene, estimator.index, matrix))[0]
+
+
+def _likeliest(estimator: TripleEstimator) -> list[Place]:
+    """Return the places that were verified, the likeliest by roads first."""
+    return sorted(estimator.verified, key=lambda place: -place.log10_likelihood)
 
 
 def _is_of_map(index: ReferenceIndex, other: ReferenceIndex) -> bool:

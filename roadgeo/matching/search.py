@@ -193,15 +193,21 @@ def search_each(
 ) -> None:
     """Search each part as if it were alone, within its own limits, until the answer of one stands out.
 
-    Parts share the work as 10 to the power of their `promise`, a log10: a small map does not wait for large ones, and
-    where an answer shows, its map is searched first. `proves` returns whether a part has the answer. It is called when
-    the best model reaches `SearchOptions.accept`, and at the end of each stage. A part ends after a
-    stage unless it `may_go_on`. `heard` is called with each part before its round.
+    Parts share the work, with that of searches before, as 10 to the power of their `promise`, a log10: a small map does
+    not wait for large ones, and where an answer shows, its map is searched first. `proves` returns whether a part has
+    the answer. It is called when the best model reaches `SearchOptions.accept`, and at the end of each stage. A part
+    ends after a stage unless it `may_go_on`. `heard` is called with each part before its round.
     """
     budgets = {part: _Budget(options) for part, options in parts.items()}
-    done = dict.fromkeys(parts, -math.inf)  # log10 of the work done, less the promise
+
+    def done(part: Search[Model]) -> float:
+        """Return the log10 of all work done on a part, less its promise."""
+        work_s = part.estimator.work
+        return (math.log10(work_s) if work_s else -math.inf) - promise(part)
+
+    turns = {part: done(part) for part in parts}
     while left := [part for part in parts if not part.stopped]:
-        part = min(left, key=done.__getitem__)
+        part = min(left, key=turns.__getitem__)
         stage = part.stage
         heard(part)
         part.advance(budgets[part])
@@ -211,8 +217,7 @@ def search_each(
             part.stopped = "accepted"
         if part.stopped in ("accepted", "time"):
             break
-        work_s = budgets[part].work_s
-        done[part] = (math.log10(work_s) if work_s else -math.inf) - promise(part)
+        turns[part] = done(part)
     for part in left:
         part.stopped = part.stopped or ("time" if budgets[part].spent == "time" else "elsewhere")
 

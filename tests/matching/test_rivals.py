@@ -284,6 +284,32 @@ def test_the_part_goes_on_whose_place_explains_most(broken, monkeypatch):
     assert not any(asked.may_go_on(part) for part, _ in pairs)  # nothing promises anything
 
 
+@pytest.mark.parametrize(
+    ("by_roads", "by_picture", "is_compared"), [(0.1, 0.1, False), (0.9, 0.1, True), (0.1, 0.9, True)]
+)
+def test_where_a_place_ended_the_search_only_others_that_explain_nearly_as_much_are_compared(
+    broken, monkeypatch, by_roads, by_picture, is_compared
+):
+    (first, estimator), (_, other) = pairs = [search_of(broken, broken[0]) for _ in range(2)]
+    found = estimator.verified[0]
+    found = found.but(scene=replace(found.scene, probability=np.ones((1, 1))))
+    weight = Weight(found.log10_likelihood, found.statement_px)
+
+    def weighed(place, share):
+        return place.but(by=weight._replace(log10_likelihood=share * weight.log10_likelihood))
+
+    other.verified = [weighed(other.verified[0], by_roads)]
+    monkeypatch.setattr(
+        rivals, "by_picture", lambda place, _: weighed(place, by_picture if place is other.verified[0] else 1.0)
+    )
+    monkeypatch.setattr(Place, "same", lambda *_: False)
+    monkeypatch.setattr(Rivals, "compare", lambda _, part: found if part is first else other.verified[0])
+    asked = Rivals(dict(pairs), Ledger(n_reference=866), 0.2 * weight.log10_likelihood)
+    assert [place is not None for _, place in asked.compare_all()] == [True, True]  # it ended without an answer
+    first.stopped = "accepted"
+    assert [place is not None for _, place in asked.compare_all()] == [True, is_compared]
+
+
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     item, estimator = search_of(broken, broken[0])
     asked = Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)

@@ -16,10 +16,11 @@ class Toy:
     plan: list[list[tuple[int, float]]]
     seconds: float = 0.0
     scored: list[int] = field(default_factory=list)
+    before: float = 0.0
 
     @property
     def work(self):
-        return float(len(self.scored))
+        return self.before + len(self.scored)
 
     def stages(self):
         yield iter(self.plan)
@@ -192,6 +193,14 @@ def test_work_is_shared_as_ten_to_the_power_of_the_promise():
     promise = {id(toy): float(n > 0) for n, toy in enumerate(toys)}
     each(*toys, promise=lambda part: promise[id(part.estimator)])
     assert [len(toy.scored) for toy in toys] == pytest.approx([20, 200, 201], abs=1)
+
+
+def test_a_part_that_promises_goes_on_before_others_begin():
+    """Work that was done on a part before counts, too."""
+    toys = [Toy([[(1000 * n + k, 1.0)] for k in range(1000)], before=1.0) for n in range(2)]
+    toys[1].plan[5] = [(1, 9.0)]
+    each(*toys, promise=lambda part: float(part.estimator is toys[1]))
+    assert [len(toy.scored) for toy in toys] == [0, 6]
 
 
 def test_a_part_does_its_next_stage_only_if_it_may():
