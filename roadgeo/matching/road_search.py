@@ -163,8 +163,6 @@ def _draw(index: ReferenceIndex) -> RoadRaster:
     return RoadRaster((x0, y0), raster, density, np.empty((n, WORDS), np.uint64), np.zeros(n, bool), radii)
 
 
-#: Where the map has hardly a road, chance is not less than this.
-_LEAST_DENSITY = 0.005
 _PER_RADIAN = WHOLE_TURN / math.tau
 _TURN_STEPS = np.radians(3.0 * np.arange(-2, 3))
 _SCALE_STEPS = np.array([0.96, 1.04])
@@ -269,9 +267,9 @@ class Voter:
         self.drawn: RoadRaster = make_raster(index)
         cells, rays = self.drawn.cells(index.xy), unpack_branches(index.branches)
         self.drawn.draw_rings_of(cells, candidates)
-        density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
         counts = np.isfinite(rays).sum(axis=1)
-        self.places = Places(cells, _whole(rays).astype(np.int32), counts, density, self.drawn.rings)
+        density, rings = self.drawn.density_at(index.xy), self.drawn.rings
+        self.places = Places(cells, _whole(rays).astype(np.int32), counts, density, rings)
 
     def votes(self, anchor: int) -> Votes:
         """Return the best proposals of a query intersection."""
