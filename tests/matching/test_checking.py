@@ -1,5 +1,6 @@
 """Given places on made-up towns: right, off, or not to be judged."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,17 @@ from shapely import affinity
 from worlds.motorways import motorways
 from worlds.scenes import PLANE, Sight, camera, look, random_lines, scene_of, soft
 
+from roadgeo.geometry.camera import CameraFault, judge
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Seconds
-from roadgeo.matching.checking import check_place
+from roadgeo.matching import checking
+from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import Searched
+from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query
 from roadgeo.matching.shifts import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.verdict import decide
 from roadgeo.roads.network import build_network
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
@@ -90,6 +96,38 @@ def test_hardly_a_road_is_no_evidence(town) -> None:
     found = check_place(truth, query_of(look(town[0], truth, (60, 60)), (60, 60)), town[1])
     assert found.verdict == "unknown"
     assert "too few roads" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("east_m", "score", "verdict"),
+    [(0.0, 0.7, "unknown"), (0.0, 1.4, "agrees"), (20.0, 1.4, "unknown"), (20.0, 2.8, "off")],
+)
+def test_the_given_place_needs_a_lower_score_than_another(town, sights, east_m, score, verdict) -> None:
+    truth, query = sights[0]
+    given, options = Place(query.scene, town[1], truth), CheckOptions()
+    best = Place(query.scene, town[1], lied(truth, query, Shift(east_m, 0, 0, 1, 0)), score=score)
+    searched = Searched(town[1], (best,), counts=Counter(searched=len(town[1])))
+    location = decide(query, [searched], checking._as_hints(given, options))
+    assert checking._judge(location, given, options).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("gsd_m", "tilt_deg", "fault"),
+    [
+        (1.08, 0.0, None),
+        (1.15, 0.0, CameraFault.SAMPLING),
+        (0.93, 0.0, None),
+        (0.87, 0.0, CameraFault.SAMPLING),
+        (1.0, 24.0, None),  # the tilt of a homography is told to some 20 degrees
+        (1.0, 28.0, CameraFault.TILT),
+    ],
+)
+def test_scale_and_tilt_may_be_a_little_off(town, gsd_m, tilt_deg, fault) -> None:
+    size = (1000, 1000)
+    views = [camera((2000.0, 2000.0), size, *view, focal_px=700.0) for view in ((1.0, 0.0), (gsd_m, tilt_deg))]
+    scene = scene_of(look(town[0], views[0], size), size)
+    hints = checking._as_hints(Place(scene, town[1], views[0]), CheckOptions())
+    assert judge(views[1], size, hints.match.camera) is fault
 
 
 def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:

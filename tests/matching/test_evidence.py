@@ -141,6 +141,28 @@ class TestShared:
         assert Evidence(scene, town[1], 1.0).shared(TRUTH, moved(TRUTH, scene, east=1e6)) == 0.0
 
 
+class TestContradicted:
+    @pytest.mark.parametrize(("row", "is_counted"), [(0, False), (1, True), (3, True), (5, True)])
+    def test_far_ground_of_an_oblique_view_does_not_count(self, town, row, is_counted):
+        """One of six rows of regions shows other roads; pixels of the first two are 2.1 and 1.5 times as coarse."""
+        size = (1000, 1000)
+        truth = camera((2000, 1900), size, 1.0, 40.0, focal_px=900.0)
+        own, other = (scene_of(look(network, truth, size), size) for network in (town[0], random_network(2, 4000.0)))
+
+        def is_there(y):
+            return (-y / size[1] * 6.0).astype(int) == row
+
+        chosen = [~is_there(own.points[:, 1]), is_there(other.points[:, 1])]
+        mixed = {
+            name: np.concatenate([getattr(own, name)[chosen[0]], getattr(other, name)[chosen[1]]])
+            for name in ("points", "directions", "weights")
+        }
+        cells = is_there(-(np.arange(len(own.field)) + 0.5) * own.field_scale)[:, None]
+        scene = replace(own, field=np.where(cells, other.field, own.field), **mixed)
+        contradicted = Evidence(scene, town[1], 1.0).contradicted(truth)
+        assert contradicted > 0.05 if is_counted else contradicted == 0.0
+
+
 class TestNearby:
     def test_it_is_far_below_the_place_where_streets_do_not_repeat(self, town, scene):
         found = Evidence(scene, town[1], 1.0)
@@ -168,6 +190,17 @@ class TestNearby:
         wrong = moved(TRUTH, scene, *step)
         found = Evidence(scene, town[1], 1.0)
         assert found.nearby(wrong, n_anchors=20) > 0.7 * found.weigh(TRUTH) > 3.0 * found.weigh(wrong)
+
+    def test_the_three_intersections_nearest_to_the_middle_lead_to_their_neighbours(self, town, scene):
+        """The frame is shifted by the step from an intersection to another, which then lies near its middle."""
+        xy, found, middle = town[1].xy, Evidence(scene, town[1], 1.0), Homography(TRUTH)(scene.center)
+        leads_back = {}
+        for a in xy[np.argsort(np.hypot(*(xy - middle).T))[:5]]:
+            steps = xy[np.argsort(np.hypot(*(xy - a).T))[3:12]] - a
+            for step in steps:
+                nearer = int((np.hypot(*(xy - middle - step).T) < np.hypot(*(a - middle))).sum())
+                leads_back[nearer] = found.nearby(moved(TRUTH, scene, *step)) > 0.9 * found.weigh(TRUTH)
+        assert [leads_back[nearer] for nearer in range(5)] == [True, True, True, False, False]
 
     def test_intersections_lead_no_further_than_the_user_allows(self, town, scene):
         found, middle = Evidence(scene, town[1], 1.0), Homography(TRUTH)(scene.center)
