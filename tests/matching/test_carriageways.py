@@ -79,6 +79,28 @@ def test_points_move_to_the_middle_and_matches_there_are_dropped(town, seen):
     assert kept[scene.intersections.xy[:, 0] < 0.5 * SIDE].mean() < 0.3
 
 
+@pytest.mark.parametrize(("part", "are_one"), [(0.25, True), (0.5, False)])
+def test_two_roads_of_the_map_that_lie_much_nearer_than_the_masks_are_one(town, seen, part, are_one):
+    truth, scene = seen
+    index = build_index(motorways(town[0], has_two(truth, 0.6), part * 18.0))
+    moved, _ = between_carriageways(truth, scene, index, np.full(len(scene.intersections), -1))
+    there = scene.points[:, 0] < 0.5 * SIDE
+    assert bool((moved.points != scene.points).any(axis=1)[there].mean() > 0.5) is are_one
+
+
+def test_matches_within_two_steps_of_such_a_road_are_dropped(town, seen):
+    truth, scene = seen
+    xy = np.random.default_rng(2).uniform((0, -SIDE), (0.5 * SIDE, 0), (600, 2))
+    scene = replace(scene, intersections=replace(scene.intersections, xy=xy))
+    moved, left = between_carriageways(truth, scene, town[1], np.arange(len(xy)))
+    there = scene.points[(moved.points != scene.points).any(axis=1)]
+    steps = np.hypot(*(xy[:, None] - there).T).min(axis=0) / (scene.road_length_px / len(scene.points))
+    assert (left[(steps > 1.2) & (steps < 1.8)] < 0).all()
+    assert (left[(steps > 2.2) & (steps < 3.8)] >= 0).all()
+    assert ((steps > 1.2) & (steps < 1.8)).any()
+    assert ((steps > 2.2) & (steps < 3.8)).any()
+
+
 def test_where_the_map_has_two_they_stay(town, seen):
     truth, scene = seen
     index = build_index(motorways(town[0], has_two(truth, 0.6), 18.0))

@@ -38,6 +38,15 @@ def test_homography_and_lens_are_found_together_and_corners_are_as_sure_as_claim
     assert straighten_scene(scene, found.lens_k1).points == pytest.approx(straight.points, abs=1.0)
 
 
+def test_roads_in_the_middle_of_a_frame_hardly_tell_a_lens_and_are_believed_in_part(town):
+    """Lenses seldom have a k1 of more than a tenth."""
+    truth, straight = sight_of(town[0], 5)
+    scene = through_lens(straight, -0.15)
+    near = np.hypot(*(scene.points - scene.center).T) < 160.0
+    few = replace(scene, points=scene.points[near], directions=scene.directions[near], weights=scene.weights[near])
+    assert -0.075 < fit_lens(truth, few, town[1], RefineOptions()).lens_k1 < -0.025
+
+
 @pytest.mark.parametrize(("k1", "pays"), [(0.0, False), (0.002, False), (-0.1, True)])
 def test_a_lens_is_taken_only_where_it_pays(town, k1, pays):
     truth, straight = sight_of(town[0], 7, tilt=10, sight=Sight(0.6))

@@ -127,6 +127,14 @@ def test_correlation_finds_the_place_among_all_shifts_and_turns(town, scene):
     assert best.log10_likelihood >= picture.weigh(peaks[0].matrix)
 
 
+@pytest.mark.parametrize("reach_m", [8000.0, 16000.0])
+def test_however_far_it_reaches_the_ground_has_about_a_thousand_cells_a_side(town, scene, monkeypatch, reach_m):
+    picture, drawn, draw = Picture(soft(scene), town[1], 1.0), [], pictures.draw_roads
+    monkeypatch.setattr(pictures, "draw_roads", lambda *of: drawn.append(draw(*of)) or drawn[-1])
+    picture.correlate(TRUTH, reach_m, (0.0,), 1, 30.0)
+    assert 800 < max(drawn[-1].roads.shape) < 1500
+
+
 def test_a_frame_too_large_for_the_ground_weighs_nothing(town, scene):
     picture = Picture(soft(scene), town[1], 1.0)
     with np.errstate(all="ignore"):
