@@ -5,9 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
+from naive import road_votes as naive
 from worlds.scenes import Sight, camera, estimator_of, look, mapped, random_network, scene_of, search
 
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.homography import Homography
 from roadgeo.matching import road_search
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.index import build_index
@@ -24,6 +27,7 @@ from roadgeo.matching.road_search import (
 )
 from roadgeo.matching.search import SearchOptions
 from roadgeo.matching.triples import WITHOUT_ROADS
+from roadgeo.roads.graph import RoadGraph
 
 SCALE = (0.2, 5.0)
 TRUTH = camera((2100, 1900), (1000, 1000), 1.0, 10.0, 20.0, 70.0)
@@ -112,6 +116,58 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     assert full.best.by_roads
 
 
+@pytest.mark.parametrize(("turned", "is_kept"), [(0.0, True), (0.5, True), (0.85, False)])
+def test_a_proposal_is_given_up_where_most_of_its_roads_lie_on_no_road(town, turned, is_kept):
+    network, index = town
+    scene = scene_of(look(network, TRUTH))
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    (at,) = mapped(TRUTH, scene.intersections.xy[[anchor]])
+    directions, some = scene.directions.copy(), np.random.default_rng(1).random(len(scene.points)) < turned
+    directions[some] = directions[some] @ np.array([[0.6, 0.8], [-0.8, 0.6]])  # as hardly a road runs
+    grower = RoadGrower(replace(scene, directions=directions), index, CameraOptions())
+    nearest = np.argmin(np.hypot(*(index.xy - at).T), keepdims=True)
+    grown = grower.grow(anchor, nearest, Homography(TRUTH).jacobian(scene.intersections.xy[anchor]).reshape(1, 4))
+    assert bool(grown) is is_kept
+
+
+@pytest.mark.parametrize(("n_points", "least", "most"), [(75, 13, 27), (110, 6, 11), (300, 5, 7)])
+def test_fewer_and_fewer_proposals_of_an_intersection_grow_on(town, n_points, least, most):
+    """Of sixty alike; the number of points is that of the stages."""
+    network, index = town
+    scene = scene_of(look(network, TRUTH))
+    some = slice(0, None, len(scene.points) // n_points + 1)
+    thin = replace(scene, points=scene.points[some], directions=scene.directions[some])
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    (at,) = mapped(TRUTH, scene.intersections.xy[[anchor]])
+    affine = Homography(TRUTH).jacobian(scene.intersections.xy[anchor]).reshape(1, 4)
+    affines = affine * (1.0 + 1e-3 * np.arange(60)[:, None] / 60)
+    nearest = np.full(60, np.argmin(np.hypot(*(index.xy - at).T)))
+    assert least <= len(RoadGrower(thin, index, CameraOptions()).grow(anchor, nearest, affines)) <= most
+
+
+def test_an_intersections_own_branches_do_not_vote_as_far_as_a_block_or_two():
+    """They agree by construction; roads beyond, and those that run otherwise, do vote."""
+    ends = [np.array([[500.0, -500.0], [500.0 + x, -500.0 + y]]) for x, y in ((450, 0), (-450, 0), (0, 450), (0, -450))]
+    cross = RoadGraph.from_polylines(
+        np.array([[500.0, -500.0], *(end[1] for end in ends)]), np.array([[0, k] for k in range(1, 5)]), ends
+    )
+    around = road_search._look_around(scene_of(cross), 0, (1.0, 1.0), 1.0)
+    marked = naive.bits_of(around.rings[0]).any(axis=(0, 2))
+    radii = RADIUS_M * RING_STEP ** (np.arange(len(marked)) + 0.5 - len(marked))
+    assert not marked[radii < 110.0].any()
+    assert marked[radii > 190.0].all()
+
+
+def test_votes_are_weighed_against_half_as_many_roads_again_as_the_map_has_there(town):
+    """Roads crowd around intersections; and at the right place a little more than half of the points meet roads."""
+    scene = scene_of(look(town[0], TRUTH))
+    voter = Voter(scene, town[1], (0.95, 1.05), (0.0, math.pi), everywhere(town[1]))
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    votes, points = voter.votes(anchor), road_search._look_around(scene, anchor, (0.95, 1.05), 1.0).points
+    each = math.log(0.55 / (1.5 * voter.places.density[votes.reference[0]]))
+    assert 0.9 * each < votes.ratio[0] / np.diff(points.starts).max() <= each
+
+
 def test_near_restricts_where_votes_are_cast(town, broken):
     index = town[1]
     everything = RoadSearch(broken, index, CameraOptions())
@@ -136,15 +192,14 @@ def test_a_known_heading_leaves_few_turns_to_try_whichever_way_it_points(town, b
     assert gap < 20.0
 
 
-def test_work_is_bounded(town, broken, monkeypatch):
-    def n_anchors(**limits):
-        for name, value in limits.items():
-            monkeypatch.setattr(road_search, name, value)
-        roads = RoadSearch(broken, town[1], CameraOptions())
-        return len(list(roads.rounds()))
-
-    assert n_anchors() == min(len(broken.intersections), road_search.N_VOTING)
-    assert n_anchors(N_VOTING=5) == 5
+def test_twenty_or_so_intersections_vote(town, broken):
+    """Not half as many, which may all be false, nor twice as many, which take twice as long."""
+    whole = scene_of(look(town[0], camera((2100, 1900), (1600, 1600))), (1600, 1600))
+    hints = CameraOptions(gsd_m=(0.9, 1.1), heading_deg=(0.0, 5.0))
+    n = len(list(RoadSearch(whole, town[1], hints).rounds()))
+    assert len(whole.intersections) > 40
+    assert 13 < n < 30
+    assert len(list(RoadSearch(broken, town[1], hints).rounds())) == len(broken.intersections) < n
 
 
 def test_proposals_far_less_likely_than_the_best_do_not_grow(town, broken, monkeypatch):
@@ -189,6 +244,17 @@ def test_the_raster_is_made_once_and_has_a_rim(town):
     assert cells[:, 0].max() <= columns - 64
     assert cells[:, 1].max() <= rows - 64
     assert not drawn.raster.bits[0].any()
+
+
+def test_roads_are_drawn_some_8_m_to_either_side(town):
+    """Cells are 6 m wide: half of their diagonal is 4.2 m."""
+    drawn, xy = make_raster(town[1]), np.random.default_rng(1).uniform(500, 3500, (4000, 2))
+    away_m = shapely.distance(shapely.points(xy), shapely.multilinestrings(town[1].segments.reshape(-1, 2, 2)))
+    columns, rows = drawn.cells(xy).astype(int).T
+    tiles = drawn.raster.tile_of[rows // 64, columns // 64]
+    marked = drawn.raster.bits[tiles, rows % 64, columns % 64] > 0
+    assert marked[away_m < 3.7].all()
+    assert not marked[(away_m > 12.3) & (away_m < 20.0)].any()
 
 
 def test_rings_are_drawn_where_they_are_asked_for(town):

@@ -73,6 +73,31 @@ def test_work_is_bounded_by_counts_not_by_the_clock(per_round, seconds):
     assert answer(result) == 19
 
 
+def test_a_usual_search_takes_some_ten_seconds_of_work_or_a_minute_by_the_clock(monkeypatch):
+    usual, seconds = SearchOptions(), 0.0
+    toy = Toy([[(k, 1.0)] for k in range(100)])
+    assert search(toy, usual).stopped == "work"
+    assert 7 < len(toy.scored) < 15
+
+    class Idle(Toy):
+        work = 0.0
+
+        def settle(self, model):
+            nonlocal seconds
+            seconds += 5.0
+            return super().settle(model)
+
+    monkeypatch.setattr("roadgeo.matching.search.time.perf_counter", lambda: seconds)
+    toy = Idle([[(k, 1.0)] for k in range(100)])
+    assert search(toy, usual).stopped == "time"
+    assert 40.0 < seconds < 90.0
+
+
+@pytest.mark.parametrize(("score", "stopped"), [(5.0, "exhausted"), (12.0, "accepted")])
+def test_a_usual_search_ends_where_a_model_scores_8(score, stopped):
+    assert search(Toy([[(1, score)], [(2, 1.0)]])).stopped == stopped
+
+
 def test_parts_share_the_work():
     toys = [Toy([[(100 * n + k, 1.0)] for k in range(50)]) for n in range(3)]
     parts = together(*toys, options=SearchOptions(work_limit_s=30.0))

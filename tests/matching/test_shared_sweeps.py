@@ -4,14 +4,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, random_network, scene_of
+from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.homography import Homography
 from roadgeo.location import Seconds
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.growing import SharedSweeps
+from roadgeo.matching.growing import SharedSweeps, screen_proposals
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
@@ -106,6 +107,22 @@ def test_what_lies_on_roads_grows_in_even_shares(monkeypatch):
     assert [len(next(sweeps.rounds(part, sweep))) for part in parts] == [4, 2]
 
 
+@pytest.mark.parametrize("n_parts", [1, 4])
+def test_of_an_anchors_proposals_some_hundreds_are_screened_fewer_grow_and_few_are_verified(n_parts):
+    """Not half as many, which may lose the right one, nor twice as many, which take twice as long."""
+    parts = [Part([[3] * (1600 // n_parts)]) for _ in range(n_parts)]
+    sweeps, sweep = swept(parts)
+    grown = []
+    for part in parts:
+        part.follow_up = lambda proposals, chosen, part=part: (
+            grown.append(len(chosen)) or Part.follow_up(part, proposals, chosen)
+        )
+    verified = sum(len(next(sweeps.rounds(part, sweep))) for part in parts)
+    assert 400 < sum(sum(part.screened) for part in parts) < 900
+    assert 100 < sum(grown) < 220
+    assert 3 <= verified <= 5
+
+
 def test_each_part_takes_what_grew_on_it_in_its_own_time():
     parts = [Part([[5], [6]]), Part([[7], [8]])]
     sweeps, sweep = swept(parts)
@@ -174,6 +191,26 @@ def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     parts = search_all(stranger, indexes, options)
     assert sum(part.estimator.n_screened for part in parts) <= 3 * 50
     assert sum(part.estimator.n_verified for part in parts) <= 3 * growing.MAX_VERIFIED
+
+
+@pytest.mark.parametrize(("turned", "is_kept"), [(0.0, True), (0.3, True), (0.5, False), (0.7, False)])
+def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(towns, turned, is_kept):
+    networks, indexes = towns
+    scene, index = scene_of(look(networks[0], TRUTH)), indexes[0]
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    (there,) = mapped(TRUTH, scene.intersections.xy[[anchor]])
+    nearest = np.argmin(np.hypot(*(index.xy - there).T), keepdims=True)
+    proposals = replace(
+        proposals_of(anchor, [2]),
+        reference=nearest,
+        affine=Homography(TRUTH).jacobian(scene.intersections.xy[anchor]).reshape(1, 4),
+    )
+    order = np.argsort(np.hypot(*(scene.points - scene.intersections.xy[anchor]).T))
+    across = scene.directions.copy()
+    some = order[np.arange(len(order)) % 10 < 10 * turned]
+    across[some] = across[some] @ np.array([[0.6, 0.8], [-0.8, 0.6]])  # as hardly a road runs
+    kept = screen_proposals(replace(scene, directions=across), index, proposals, np.array([0]))
+    assert bool(len(kept)) is is_kept
 
 
 # --- each unit of a part that is searched alone -----------------------------------------------------------------------
