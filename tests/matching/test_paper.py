@@ -240,14 +240,18 @@ def test_of_two_that_come_near_one_the_nearer_matches_it(reference, index):
     np.testing.assert_array_equal(matched, np.column_stack([1 + np.arange(len(seen)), seen]))
 
 
-def test_more_than_the_share_must_match(reference, index):
+@pytest.mark.parametrize("is_last", [False, True])
+def test_more_than_the_share_must_match(reference, index, is_last):
+    """Whether those that miss are judged first or last."""
     truth = camera(np.random.default_rng(2), (2000, 2000))
     query, _ = view(reference, truth)
     for n in (len(query), len(query) - 1):
+        some = query.only(np.arange(n))
+        judged = searching(some, index, PairOptions(), None).judges[:: -1 if is_last else 1]
         for lost, row in (((n + 1) // 2, -1), ((n - 1) // 2, 0)):
-            some = query.only(np.arange(n))
-            some.xy[:lost] += 1e6
-            search = searching(some, index, PairOptions(), None)
+            xy = some.xy.copy()
+            xy[judged[:lost]] += 1e6
+            search = searching(replace(some, xy=xy), index, PairOptions(), None)
             assert search.count(truth.matrix[None], search.best)[1] == row
 
 
