@@ -46,6 +46,32 @@ def test_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     write_twice(tmp_path, "may write to")
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+def test_where_none_may_leave_its_folder_a_copy_takes_the_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_full: bool
+) -> None:
+    """Inside the fence of an old Linux; the copy is whole or not there, too."""
+    rename, target = Path.replace, tmp_path / "a.txt"
+    target.write_text("old")
+
+    def within(path: Path, other: Path) -> Path:
+        if path.parent != other.parent:
+            raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+        return rename(path, other)
+
+    def fill(source: Path, copy: Path) -> None:
+        copy.write_text("ne")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "replace", within)
+    if is_full:
+        monkeypatch.setattr("shutil.copyfile", fill)
+    with pytest.raises(OutputError, match="free some space") if is_full else nullcontext():
+        write_text(target, "new")
+    assert target.read_text() == ("old" if is_full else "new")
+    assert list(tmp_path.iterdir()) == [target]
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])
 def test_nothing_is_left_when_writing_fails(tmp_path: Path, error: type[BaseException]) -> None:
     def fail() -> None:
