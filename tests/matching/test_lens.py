@@ -4,7 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, estimator_of, mapped, random_network, search, shaken, sight_of
+from worlds.scenes import (
+    Sight,
+    camera,
+    estimator_of,
+    look,
+    mapped,
+    random_network,
+    scene_of,
+    search,
+    shaken,
+    sight_of,
+)
 
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching import finishing
@@ -94,6 +105,17 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_without_a_lens(
     assert found.lens_k1 == 0.0  # else it would be taken for one behind a lens
     assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
     assert grow_whole(truth, *given) is None  # nothing is gained
+
+
+@pytest.mark.parametrize(("azimuth_deg", "k1"), [(0.0, 0.0), (0.0, -0.16), (50.0, 0.1)])
+def test_a_fit_grows_over_an_oblique_frame_of_two_kilometres(town, azimuth_deg, k1):
+    """It takes a dozen steps, of which each reaches a little further."""
+    size = (2000, 2000)
+    truth = camera((2000, 2000), size, 1.0, 35.0, azimuth_deg, 0.6 * azimuth_deg, 2000.0)
+    straight = scene_of(look(town[0], truth, size, Sight(0.6, 0.1, 0.1), int(azimuth_deg) // 50), size)
+    scene = through_lens(straight, k1)
+    found = fit_lens(bent_start(truth, scene, k1), scene, town[1], RefineOptions(), 0.0 if k1 else None)
+    assert np.hypot(*(mapped(found.matrix, scene.corners) - mapped(truth, scene.corners)).T).max() < 1.2
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -168,6 +168,20 @@ def test_votes_are_weighed_against_half_as_many_roads_again_as_the_map_has_there
     assert 0.9 * each < votes.ratio[0] / np.diff(points.starts).max() <= each
 
 
+@pytest.mark.parametrize("off_deg", [-6.0, -3.0, 3.0, 6.0])
+def test_a_turn_that_branches_tell_some_degrees_wrong_is_put_right(town, off_deg):
+    scene, index = scene_of(look(town[0], TRUTH)), town[1]
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    own = scene.intersections
+    turned = replace(scene, intersections=replace(own, rays=own.rays + np.float32(math.radians(off_deg))))
+    (votes,) = best_votes(turned, index, [anchor], (0.95, 1.05))
+    (at,) = mapped(TRUTH, own.xy[[anchor]])
+    best = votes.affine[np.flatnonzero(votes.reference == np.argmin(np.hypot(*(index.xy - at).T)))[0]].reshape(2, 2)
+    expected = Homography(TRUTH).jacobian(own.xy[anchor])
+    turn = math.atan2(best[1, 0], best[0, 0]) - math.atan2(expected[1, 0], expected[0, 0])
+    assert abs(math.degrees(turn)) < 1.4
+
+
 def test_near_restricts_where_votes_are_cast(town, broken):
     index = town[1]
     everything = RoadSearch(broken, index, CameraOptions())
