@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from worlds.scenes import PLANE, Sight, camera, look, random_lines, scene_of, so
 
 from roadgeo.geometry.camera import CameraFault, judge
 from roadgeo.geometry.homography import Homography
-from roadgeo.location import Seconds
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.location import Location, Seconds
 from roadgeo.matching import checking
 from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.index import build_index
@@ -96,6 +98,36 @@ def test_hardly_a_road_is_no_evidence(town) -> None:
     found = check_place(truth, query_of(look(town[0], truth, (60, 60)), (60, 60)), town[1])
     assert found.verdict == "unknown"
     assert "too few roads" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("shown_m", "mapped_m", "reason"),
+    [(220.0, 9e3, "too few roads"), (420.0, 220.0, "not on this map"), (420.0, 420.0, "no place within")],
+)
+def test_mask_and_map_must_show_some_hundred_metres_of_road(
+    town, sights, monkeypatch, shown_m, mapped_m, reason
+) -> None:
+    truth, query = sights[0]
+    monkeypatch.setattr(checking.Place, "gsd_m", 1.0)
+    monkeypatch.setattr("roadgeo.matching.evidence.Evidence.mapped_px", lambda *_: mapped_m)
+    monkeypatch.setattr(checking, "_locate", lambda *_: Location("", "not_located", ""))
+    few = replace(query, scene=replace(query.scene, road_length_px=shown_m))
+    assert reason in check_place(truth, few, town[1]).reason
+
+
+@pytest.mark.parametrize(
+    ("off_m", "sigma_m", "verdict"),
+    [(2.2, 0.5, "agrees"), (4.5, 0.5, "off"), (2.2, 2.2, "agrees"), (2.2, 4.5, "unknown"), (9.0, 4.5, "unknown")],
+)
+def test_a_place_agrees_to_3_m_and_is_judged_where_it_is_known_to_3_m(
+    town, sights, monkeypatch, off_m, sigma_m, verdict
+) -> None:
+    truth, query = sights[0]
+    offset = SimpleNamespace(over=lambda _: off_m, sigma_over=lambda _: sigma_m, significance=100.0)
+    monkeypatch.setattr(checking, "_displacement", lambda *_: offset)
+    best = SimpleNamespace(matrix=truth @ PIXEL_TO_PLANE, score=9.0, rival=None)
+    location = SimpleNamespace(located=True, places=[best])
+    assert checking._judge(location, Place(query.scene, town[1], truth), CheckOptions()).verdict == verdict
 
 
 @pytest.mark.parametrize(

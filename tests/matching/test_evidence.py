@@ -141,6 +141,17 @@ class TestShared:
         assert Evidence(scene, town[1], 1.0).shared(TRUTH, moved(TRUTH, scene, east=1e6)) == 0.0
 
 
+def mixed(own, other, is_there):
+    """A scene with the roads of another where `is_there` says so of x and y, pixels."""
+    chosen = [~is_there(*own.points.T), is_there(*other.points.T)]
+    roads = {
+        name: np.concatenate([getattr(own, name)[chosen[0]], getattr(other, name)[chosen[1]]])
+        for name in ("points", "directions", "weights")
+    }
+    rows, columns = ((np.arange(n) + 0.5) * own.field_scale for n in own.field.shape)
+    return replace(own, field=np.where(is_there(columns, -rows[:, None]), other.field, own.field), **roads)
+
+
 class TestContradicted:
     @pytest.mark.parametrize(("row", "is_counted"), [(0, False), (1, True), (3, True), (5, True)])
     def test_far_ground_of_an_oblique_view_does_not_count(self, town, row, is_counted):
@@ -148,19 +159,24 @@ class TestContradicted:
         size = (1000, 1000)
         truth = camera((2000, 1900), size, 1.0, 40.0, focal_px=900.0)
         own, other = (scene_of(look(network, truth, size), size) for network in (town[0], random_network(2, 4000.0)))
-
-        def is_there(y):
-            return (-y / size[1] * 6.0).astype(int) == row
-
-        chosen = [~is_there(own.points[:, 1]), is_there(other.points[:, 1])]
-        mixed = {
-            name: np.concatenate([getattr(own, name)[chosen[0]], getattr(other, name)[chosen[1]]])
-            for name in ("points", "directions", "weights")
-        }
-        cells = is_there(-(np.arange(len(own.field)) + 0.5) * own.field_scale)[:, None]
-        scene = replace(own, field=np.where(cells, other.field, own.field), **mixed)
+        scene = mixed(own, other, lambda x, y: (x > 0.0) & ((-y / size[1] * 6.0).astype(int) == row))
         contradicted = Evidence(scene, town[1], 1.0).contradicted(truth)
         assert contradicted > 0.05 if is_counted else contradicted == 0.0
+
+    @pytest.mark.parametrize(("side", "n"), [(2000, 6), (510, 3)])
+    def test_regions_are_a_sixth_of_the_frame_and_170_m_wide_at_least(self, town, side, n):
+        """One shows other roads, of which half a region is usual: in smaller regions less is, in larger ones no more."""
+        size, width = (side, side), side / n
+        truth, found = camera((2000, 1900), size), []
+        own, other = (scene_of(look(network, truth, size), size) for network in (town[0], random_network(2, 4000.0)))
+        for column, row in itertools.product(range(n - 3, n) if n > 3 else range(n), repeat=2):
+            scene = mixed(
+                own,
+                other,
+                lambda x, y, column=column, row=row: ((x // width) == column) & ((-y // width) == row),
+            )
+            found.append(Evidence(scene, town[1], 1.0).contradicted(truth) * n**2)
+        assert 0.32 < np.median(found) < 0.52
 
 
 class TestNearby:

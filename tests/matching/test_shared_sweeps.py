@@ -12,7 +12,7 @@ from roadgeo.location import Seconds
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.growing import SharedSweeps, screen_proposals
+from roadgeo.matching.growing import SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
@@ -211,6 +211,61 @@ def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(
     across[some] = across[some] @ np.array([[0.6, 0.8], [-0.8, 0.6]])  # as hardly a road runs
     kept = screen_proposals(replace(scene, directions=across), index, proposals, np.array([0]))
     assert bool(len(kept)) is is_kept
+
+
+def grown_from_the_middle(town, change):
+    """The place that grows from a true proposal for the intersection in the middle, once `change` moved the others.
+
+    It is given the query's places, (N, 2) pixels of a metre, and which of these are not seeds, outwards from the middle.
+    """
+    network, index = town
+    truth = camera((1000, 1000), (1600, 1600))
+    scene = scene_of(look(network, truth, (1600, 1600)), (1600, 1600))
+    own, outwards = scene.intersections, np.argsort(np.hypot(*(scene.intersections.xy - scene.center).T))
+    anchor = int(outwards[0])
+    matched = Place(scene, index, truth).matched
+    partners = matched[scene.neighbours[anchor][:6]]
+    others = outwards[1:][~np.isin(outwards[1:], scene.neighbours[anchor][:6])]
+    xy = own.xy.copy()
+    change(xy, others)
+    proposals = replace(
+        proposals_of(anchor, [6]),
+        reference=matched[[anchor]],
+        affine=Homography(truth).jacobian(own.xy[anchor]).reshape(1, 4),
+        partners=partners[None],
+    )
+    moved = replace(scene, intersections=replace(own, xy=xy))
+    return grow_proposals(moved, index, proposals, np.array([0]), CameraOptions()), others
+
+
+@pytest.mark.parametrize(("off_m", "least", "most"), [(0.0, 0.9, 1.0), (7.0, 0.8, 1.0), (14.0, 0.0, 0.4)])
+def test_intersections_match_where_they_are_off_by_some_metres(towns, off_m, least, most):
+    def shake(xy, others):
+        turn = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(others))
+        xy[others[::3]] += off_m * np.stack([np.cos(turn), np.sin(turn)], axis=1)[::3]
+
+    (place,), others = grown_from_the_middle([own[0] for own in towns], shake)
+    assert least <= (place.grown[others[::3]] >= 0).mean() <= most
+
+
+@pytest.mark.parametrize(("n_lost", "is_kept"), [(20, True), (36, False)])
+def test_a_proposal_is_given_up_where_few_of_the_nearest_intersections_match(towns, n_lost, is_kept):
+    def lose(xy, others):
+        xy[others[:n_lost]] += np.array([37.0, 29.0])  # some meet others by chance
+
+    grown, _ = grown_from_the_middle([own[0] for own in towns], lose)
+    assert bool(grown) is is_kept
+
+
+def test_a_match_counts_more_than_three_intersections_without_one(towns):
+    """At the right place a little less than half of them match, by chance one in twelve."""
+
+    def lose(xy, others):
+        xy[others[::5]] += np.array([37.0, 29.0])
+
+    (place,), others = grown_from_the_middle([own[0] for own in towns], lose)
+    n = int((place.grown[others] >= 0).sum())
+    assert place.support == pytest.approx(n * np.log(0.45 / 0.08) + (len(others) - n) * np.log(0.55 / 0.92))
 
 
 # --- each unit of a part that is searched alone -----------------------------------------------------------------------
