@@ -165,7 +165,7 @@ class TestContradicted:
 
     @pytest.mark.parametrize(("side", "n"), [(2000, 6), (510, 3)])
     def test_regions_are_a_sixth_of_the_frame_and_170_m_wide_at_least(self, town, side, n):
-        """One shows other roads, of which half a region is usual: in smaller regions less is, in larger ones no more."""
+        """One of them shows other roads. Half a region is usual, which is less where regions are smaller."""
         size, width = (side, side), side / n
         truth, found = camera((2000, 1900), size), []
         own, other = (scene_of(look(network, truth, size), size) for network in (town[0], random_network(2, 4000.0)))

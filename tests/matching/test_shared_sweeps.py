@@ -216,7 +216,7 @@ def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(
 def grown_from_the_middle(town, change):
     """The place that grows from a true proposal for the intersection in the middle, once `change` moved the others.
 
-    It is given the query's places, (N, 2) pixels of a metre, and which of these are not seeds, outwards from the middle.
+    It is given the query's places, (N, 2) metres, and those of them that are no seeds, outwards from the middle.
     """
     network, index = town
     truth = camera((1000, 1000), (1600, 1600))
