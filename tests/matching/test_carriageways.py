@@ -88,6 +88,15 @@ def test_two_roads_of_the_map_that_lie_much_nearer_than_the_masks_are_one(town, 
     assert bool((moved.points != scene.points).any(axis=1)[there].mean() > 0.5) is are_one
 
 
+@pytest.mark.parametrize(("apart_m", "are_one"), [(2.2, False), (4.5, True), (25.0, True), (45.0, False)])
+def test_carriageways_are_neither_the_edges_of_a_road_nor_a_block_apart(town, seen, apart_m, are_one):
+    truth, _ = seen
+    scene = sight(town, truth, apart_m=apart_m)
+    moved, _ = between_carriageways(truth, scene, town[1], np.full(len(scene.intersections), -1))
+    there = scene.points[:, 0] < 0.5 * SIDE
+    assert bool((moved.points != scene.points).any(axis=1)[there].mean() > 0.5) is are_one
+
+
 def test_matches_within_two_steps_of_such_a_road_are_dropped(town, seen):
     truth, scene = seen
     xy = np.random.default_rng(2).uniform((0, -SIDE), (0.5 * SIDE, 0), (600, 2))

@@ -90,6 +90,14 @@ def test_fewer_points_do_nearly_as_well(town):
     assert np.abs(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).max() < 2
 
 
+@pytest.mark.parametrize("gsd", [0.3, 2.0])
+def test_no_corner_is_surer_than_lines_are_drawn(town, exact, gsd):
+    """To a tenth of a metre on the map, and a seventh of a pixel in the mask."""
+    truth, scene = sight_of(town[0], 3, gsd=gsd)
+    result = refined(truth, scene, exact, gsd)
+    assert result.corner_sigma_m == pytest.approx(np.full(4, math.hypot(0.1, 0.15 * gsd)), rel=0.3)
+
+
 def test_a_floor_under_every_claim(town, monkeypatch):
     truth, scene = sight_of(town[0], 7)
     matched = Place(scene, town[1], truth).matched
