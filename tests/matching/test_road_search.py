@@ -224,6 +224,9 @@ def test_proposals_far_less_likely_than_the_best_do_not_grow(town, broken, monke
     likely = int((votes.ratio >= 0.5 * votes.ratio[0]).sum())
     assert 1 <= likely < 80 < len(votes.ratio)
     assert first_round().n_proposed == likely
+    with monkeypatch.context() as patch:
+        patch.setattr(road_search, "_LIKELY", -math.inf)
+        assert 50 < first_round().n_proposed < 120  # however likely all are
     monkeypatch.setattr(road_search, "_MAX_GROWN", 3)
     assert first_round().n_proposed == min(likely, 3)
 
