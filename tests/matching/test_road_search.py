@@ -76,7 +76,9 @@ def test_limits_on_scale_and_turn_are_kept(town, broken, up):
 
 
 def test_on_a_coarse_map_small_pixels_are_not_looked_for():
-    assert scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0) == (6.0 * COARSE_PIXEL_M, 12.0)
+    low, high = scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0)
+    assert (low, high) == (6.0 * COARSE_PIXEL_M, 12.0)
+    assert 1.5 < low < 3.0  # for roads six times as far apart as a city's
     assert scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0, 6.0)[0] > 0.5
 
 
@@ -180,6 +182,36 @@ def test_a_turn_that_branches_tell_some_degrees_wrong_is_put_right(town, off_deg
     expected = Homography(TRUTH).jacobian(own.xy[anchor])
     turn = math.atan2(best[1, 0], best[0, 0]) - math.atan2(expected[1, 0], expected[0, 0])
     assert abs(math.degrees(turn)) < 1.4
+
+
+@pytest.mark.parametrize("scale", [0.962, 1.04])
+def test_a_scale_between_those_tried_is_put_right(town, scale):
+    scene, index = scene_of(look(town[0], camera((2100, 1900)))), town[1]
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    (votes,) = best_votes(scene, index, [anchor], (scale, scale))
+    (at,) = mapped(camera((2100, 1900)), scene.intersections.xy[[anchor]])
+    best = votes.affine[np.flatnonzero(votes.reference == np.argmin(np.hypot(*(index.xy - at).T)))[0]]
+    assert np.hypot(best[0], best[2]) == pytest.approx(1.0, abs=0.012)
+
+
+def test_the_best_hundreds_of_proposals_are_judged_anew(town):
+    votes = max(best_votes(scene_of(look(town[0], TRUTH)), town[1], range(20, 30)), key=lambda votes: votes.n_tried)
+    assert votes.n_tried > 700
+    assert 250 < len(votes.reference) < 650
+
+
+@pytest.mark.parametrize(("off_m", "is_kept"), [(11.0, True), (25.0, False)])
+def test_roads_lie_on_roads_that_are_off_by_some_metres(town, off_m, is_kept):
+    network, index = town
+    scene = scene_of(look(network, TRUTH))
+    anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
+    (at,) = mapped(TRUTH, scene.intersections.xy[[anchor]])
+    side = np.random.default_rng(1).choice([-off_m, off_m], (len(scene.points), 1))  # no fit is better
+    points = scene.points + side * scene.directions[:, ::-1] * (-1.0, 1.0)
+    grower = RoadGrower(replace(scene, points=points), index, CameraOptions())
+    nearest = np.argmin(np.hypot(*(index.xy - at).T), keepdims=True)
+    grown = grower.grow(anchor, nearest, Homography(TRUTH).jacobian(scene.intersections.xy[anchor]).reshape(1, 4))
+    assert bool(grown) is is_kept
 
 
 def test_near_restricts_where_votes_are_cast(town, broken):

@@ -193,8 +193,8 @@ def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     assert sum(part.estimator.n_verified for part in parts) <= 3 * growing.MAX_VERIFIED
 
 
-@pytest.mark.parametrize(("turned", "is_kept"), [(0.0, True), (0.3, True), (0.5, False), (0.7, False)])
-def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(towns, turned, is_kept):
+def is_screened(towns, change):
+    """Whether a true proposal passes once `change` moved and turned the roads, nearest to the anchor first."""
     networks, indexes = towns
     scene, index = scene_of(look(networks[0], TRUTH)), indexes[0]
     anchor = int(np.argmin(np.hypot(*(scene.intersections.xy - scene.center).T)))
@@ -206,11 +206,35 @@ def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(
         affine=Homography(TRUTH).jacobian(scene.intersections.xy[anchor]).reshape(1, 4),
     )
     order = np.argsort(np.hypot(*(scene.points - scene.intersections.xy[anchor]).T))
-    across = scene.directions.copy()
-    some = order[np.arange(len(order)) % 10 < 10 * turned]
-    across[some] = across[some] @ np.array([[0.6, 0.8], [-0.8, 0.6]])  # as hardly a road runs
-    kept = screen_proposals(replace(scene, directions=across), index, proposals, np.array([0]))
-    assert bool(len(kept)) is is_kept
+    points, directions = scene.points[order], scene.directions[order]
+    change(points, directions)
+    scene = replace(scene, points=points, directions=directions)
+    return len(screen_proposals(scene, index, proposals, np.array([0]))) == 1
+
+
+@pytest.mark.parametrize(("turned", "is_kept"), [(0.0, True), (0.3, True), (0.5, False), (0.7, False)])
+def test_a_proposal_grows_where_more_than_half_of_the_roads_around_lie_on_roads(towns, turned, is_kept):
+    def turn(points, directions):
+        some = np.arange(len(points)) % 10 < 10 * turned
+        directions[some] = directions[some] @ np.array([[0.6, 0.8], [-0.8, 0.6]])  # as hardly a road runs
+
+    assert is_screened(towns, turn) is is_kept
+
+
+@pytest.mark.parametrize(("n_right", "is_kept"), [(15, False), (28, True)])
+def test_some_forty_points_around_decide(towns, n_right, is_kept):
+    def turn(points, directions):
+        directions[n_right:] = directions[n_right:] @ np.array([[0.6, 0.8], [-0.8, 0.6]])
+
+    assert is_screened(towns, turn) is is_kept
+
+
+@pytest.mark.parametrize(("off_m", "is_kept"), [(8.0, True), (15.0, False)])
+def test_roads_around_lie_on_roads_that_are_off_by_some_metres(towns, off_m, is_kept):
+    def shift(points, directions):
+        points += off_m * directions[:, ::-1] * (-1.0, 1.0)
+
+    assert is_screened(towns, shift) is is_kept
 
 
 def grown_from_the_middle(town, change):

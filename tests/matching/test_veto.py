@@ -117,6 +117,15 @@ def test_where_hints_lead_to_nothing_only_a_place_that_would_be_reported_is_name
     assert answer(town, strict, []).reason_code is Reason.NOTHING_STANDS_OUT
 
 
+@pytest.mark.parametrize(("score", "least_s", "most_s"), [(1.0, 0.7, 1.4), (9.0, 9.0, 11.0)])
+def test_where_hints_lead_to_nothing_little_work_is_spent_without_them(town, monkeypatch, score, least_s, most_s):
+    query, index = town
+    limits = []
+    monkeypatch.setattr(veto, "search_references", lambda *of: limits.append(of[2].search.work_limit_s) or [])
+    answer(town, hinted(town), [Place(query.scene, index, TRUTH, score=score)])
+    assert least_s < limits[0] < most_s
+
+
 @pytest.mark.parametrize(
     ("turn_deg", "scale", "east_m", "is_other"),
     [
