@@ -117,6 +117,16 @@ def test_errors_of_a_bent_mask_keep_their_sign_further(town, monkeypatch):
     assert np.array(claims) / claims[0] == pytest.approx([1.0, 1.0, 2.0], rel=0.05)
 
 
+def test_claims_of_a_blurred_mask_are_for_its_errors_two_or_three_times_as_wide_as_of_a_sharp_one(town, monkeypatch):
+    monkeypatch.setattr(refinement, "_SIGMA_FLOOR", (0.0, 0.0))
+    wide = []
+    for sigma_m in (0.3, 3.0):
+        truth, scene = sight_of(town[0], 4, sight=Sight(sigma_m))
+        result = refine(truth, scene, town[1], np.full(len(scene.intersections), -1), held=True)
+        wide.append(result.corner_sigma_m.mean() / result.rms_m)
+    assert 1.8 < wide[1] / wide[0] < 3.8
+
+
 def test_nothing_to_stand_on_is_no_refinement(town):
     truth, scene = sight_of(town[0], 8)
     nowhere = np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1]]) @ truth
