@@ -162,6 +162,33 @@ def test_similar_places_point_where_the_image_may(broken):
     assert len(there) >= len(anywhere) - n_turned(anywhere)
 
 
+def test_places_around_are_looked_for_in_turns_by_a_right_angle_as_streets_repeat(broken, monkeypatch):
+    truth, index, evidence = broken
+    turns = []
+
+    def search(turned, *_):
+        turns.append(round(pose(turned, evidence.scene.size).rotation_deg - 15.0) % 360)  # its heading
+        return []
+
+    monkeypatch.setattr(rivals, "search_nearby", search)
+    similar_places(Place(evidence.scene, index, truth), evidence.compared_with(truth), MatchOptions())
+    assert sorted(turns) == [0, 90, 180, 270]
+
+
+def test_of_the_places_met_the_likeliest_dozen_or_so_may_be_the_best(broken, monkeypatch):
+    """Not half as many, which may all contradict roads, nor twice as many, which take twice as long."""
+    truth, index, evidence = broken
+    item, estimator = search_of(broken)
+    met = [Place(evidence.scene, index, shifted(truth, 60.0 * k, 0.0), by=Weight(20.0 - k, 480.0)) for k in range(40)]
+    estimator.verified.extend(met)
+    asked = set()
+    monkeypatch.setattr(rivals, "_penalty", lambda place: asked.add(id(place)) or 0.0)
+    monkeypatch.setattr(Rivals, "_compare", lambda self, estimator, best, ranked: best)
+    Rivals({item: estimator}, Ledger(n_reference=866), NEEDED)._by_roads(item)
+    assert {id(place) for place in met[:8]} <= asked
+    assert len(asked) < 18
+
+
 def test_places_that_differ_by_little_everywhere_are_equal(broken):
     truth, _, evidence = broken
     compare, whole = evidence.compared_with(truth), evidence.weigh(truth)
