@@ -195,15 +195,16 @@ def search_each(
 
     Parts share the work, with that of searches before, as 10 to the power of their `promise`, a log10: a small map does
     not wait for large ones, and where an answer shows, its map is searched first. `proves` returns whether a part has
-    the answer. It is called when the best model reaches `SearchOptions.accept`, and at the end of each stage. A part
-    ends after a stage unless it `may_go_on`. `heard` is called with each part before its round.
+    the answer. It is called when the best model reaches `SearchOptions.accept`, and at the end of each stage. A later
+    stage gets a tenth of the work, and ends unless its part `may_go_on`. `heard` is called with each part before its
+    round.
     """
     budgets = {part: _Budget(options) for part, options in parts.items()}
 
     def done(part: Search[Model]) -> float:
-        """Return the log10 of all work done on a part, less its promise."""
+        """Return the log10 of all work done on a part, less its promise, which each stage lowers."""
         work_s = part.estimator.work
-        return (math.log10(work_s) if work_s else -math.inf) - promise(part)
+        return (math.log10(work_s) if work_s else -math.inf) - promise(part) + part.stage
 
     turns = {part: done(part) for part in parts}
     while left := [part for part in parts if not part.stopped]:
@@ -211,7 +212,7 @@ def search_each(
         stage = part.stage
         heard(part)
         part.advance(budgets[part])
-        ended = part.ended or (part.stage > stage and not may_go_on(part))
+        ended = part.ended or (part.stage > 0 and not may_go_on(part))
         part.stopped = budgets[part].spent or ("exhausted" if ended else "")
         if (part.score >= parts[part].accept or part.stage > stage or part.stopped) and proves(part):
             part.stopped = "accepted"

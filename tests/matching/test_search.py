@@ -235,6 +235,15 @@ def test_a_part_does_its_next_stage_only_if_it_may():
     assert [part.stopped for part in parts] == ["exhausted", "accepted"]
 
 
+def test_a_later_stage_gets_a_tenth_of_the_work_and_ends_where_another_part_may_go_on():
+    ahead, behind = InStages([[(1, 1.0)], *([(k, 1.0)] for k in range(2, 99))]), Toy([[(k, 1.0)] for k in range(60)])
+    ahead.stages = lambda: iter([iter(ahead.plan[:1]), iter(ahead.plan[1:])])
+    behind.plan[50] = [(50, 9.0)]
+    parts = each(ahead, behind, may_go_on=lambda part: len(behind.scored) < 40)
+    assert (len(ahead.scored), len(behind.scored)) == (pytest.approx(5, abs=1), 51)
+    assert [part.stopped for part in parts] == ["exhausted", "accepted"]
+
+
 def test_each_part_has_its_own_limit_of_work():
     toys = [Toy([[(100 * n + k, 1.0)] for k in range(50)]) for n in range(2)]
     toys[1].plan = toys[1].plan[:5]
