@@ -12,7 +12,6 @@ import contextlib
 import os
 import pickle
 import socket
-import threading
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -21,7 +20,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from roadgeo._progress import Say
 from roadgeo.errors import RoadgeoError, how_to_install
 from roadgeo.running.pool import Lost, Pool, Work, enter
 from roadgeo.running.processes import without_interrupts
@@ -31,9 +29,6 @@ __all__ = ["Cluster", "DaskWorkers"]
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-#: Tasks under way for each worker.
-_AHEAD = 2
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
@@ -121,12 +116,18 @@ class DaskWorkers(Pool):
         """Return their addresses, in order; at least one."""
         return sorted(self._client.nthreads()) or [""]
 
-    def busy(self) -> int:
-        """Return how many tasks keep them busy."""
-        return _AHEAD * len(self._client.nthreads()) + 1
+    def count(self) -> int:
+        """Return how many there are."""
+        return len(self._client.nthreads())
 
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:  # noqa: ARG002
-        """Have one do a task, the one whose address is `task.worker` if it is there.
+    def submit(self, task: Any, *_: Any) -> Any:
+        """Have one do a task, the one whose address is `task.worker` if it is there."""
+        worker = getattr(task, "worker", "")
+        where = {"workers": [worker], "allow_other_workers": True} if worker else {}
+        return self._client.submit(do_prepared, self._made, task, pure=False, **where)
+
+    def result(self, future: Any, *_: Any) -> Any:
+        """Wait for the result of a task.
 
         Raises
         ------
@@ -136,9 +137,6 @@ class DaskWorkers(Pool):
         from distributed import wait
         from distributed.scheduler import KilledWorker
 
-        worker = getattr(task, "worker", "")
-        where = {"workers": [worker], "allow_other_workers": True} if worker else {}
-        future = self._client.submit(do_prepared, self._made, task, pure=False, **where)
         try:
             while not future.done():
                 try:

@@ -1,8 +1,8 @@
 """One pool: tasks in, results in order. A worker that dies, takes too long or is called off is a result like others.
 
 Workers are processes of this machine (`processes`) or of a cluster (`cluster`). A task whose worker died is done once
-more, in a batch with no other beside it, for memory may have been the cause; then it is lost. No more results wait to
-be read than some for each worker, and no more tasks are under way than keep the workers busy.
+more, in a batch with no other beside it, for memory may have been the cause; then it is lost. No more tasks begin, or
+wait with their results to be read, than some for each worker.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -26,7 +25,7 @@ __all__ = ["Lost", "Pool", "Work", "enter"]
 TaskIn = TypeVar("TaskIn", contravariant=True)
 ResultOut = TypeVar("ResultOut", covariant=True)
 
-#: Results for each worker that may wait until those before them are there.
+#: Tasks for each worker that may have begun, or be done, before the result of the first of them is there.
 _UNREAD = 16
 
 
@@ -67,12 +66,16 @@ class Pool(ABC):
     work: Any
 
     @abstractmethod
-    def busy(self) -> int:
-        """Return how many tasks under way keep the workers busy; they may come and go."""
+    def count(self) -> int:
+        """Return how many workers there are; they may come and go."""
 
     @abstractmethod
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Have one do a task, and return its result, or why it is lost; raises what the task raised."""
+    def submit(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+        """Have one do a task, and return its future."""
+
+    @abstractmethod
+    def result(self, future: Any, called_off: threading.Event) -> Any:
+        """Wait for the result of a task, and return it, or why it is lost; raises what the task raised."""
 
     def run(
         self,
@@ -83,7 +86,7 @@ class Pool(ABC):
     ) -> Iterator[Any]:
         """Do all tasks and yield their results in order, each as soon as it and those before it are there.
 
-        Once nobody reads any more no task begins; those under way go on until the workers are ended.
+        Those that were submitted go on until the workers are ended.
 
         Parameters
         ----------
@@ -94,27 +97,18 @@ class Pool(ABC):
         called_off : Event, optional
             Once it is set nobody waits for the results any more.
         """
-        waiting, begun = iter(tasks), deque[Future[Any]]()
-        ask = partial(self.ask, patience_s=patience_s, say=say, called_off=called_off or threading.Event())
-        threads = ThreadPoolExecutor(len(tasks) or 1, "roadgeo-pool")  # which starts no more than are busy
-
-        try:
-            for task in tasks:
-                while True:
-                    busy, under_way = self.busy(), [future for future in begun if not future.done()]
-                    room = min(busy - len(under_way), _UNREAD * busy - len(begun))
-                    more = [threads.submit(ask, each) for each in islice(waiting, max(room, 0))]
-                    begun.extend(more)
-                    if begun[0].done():
-                        break
-                    wait(under_way + more, return_when=FIRST_COMPLETED)
-                result = begun.popleft().result()
-                if isinstance(result, Lost) and result.why == "died":
-                    wait(begun)
-                    result = ask(task)
-                yield self.work.give_up(task, result) if isinstance(result, Lost) else result
-        finally:
-            threads.shutdown(wait=False)
+        called_off = called_off or threading.Event()
+        waiting, begun = iter(tasks), deque[Any]()
+        for task in tasks:
+            more = islice(waiting, max(_UNREAD * self.count() - len(begun), not begun))
+            begun.extend(self.submit(each, patience_s, say, called_off) for each in more)
+            result = self.result(begun.popleft(), called_off)
+            if isinstance(result, Lost) and result.why == "died":
+                with suppress(Exception):  # each is raised in its turn
+                    for other in begun:
+                        self.result(other, called_off)
+                result = self.result(self.submit(task, patience_s, say, called_off), called_off)
+            yield self.work.give_up(task, result) if isinstance(result, Lost) else result
 
 
 # --- in a worker ------------------------------------------------------------------------------------------------------

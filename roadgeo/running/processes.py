@@ -12,7 +12,9 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
@@ -41,7 +43,6 @@ _GRACE_S = 5.0
 _START_S = 120.0
 #: Interval of checks whether somebody still waits.
 _GLANCE_S = 0.25
-_WAITING: Any = ("waiting", None)
 _CALLED_OFF = Lost("called off", "it was called off")
 
 
@@ -54,7 +55,7 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
         yield from map(work.prepare(), tasks) if tasks else ()
         return
     _require_guard()
-    with contextlib.closing(Processes(work, min(jobs, len(tasks)))) as processes:
+    with contextlib.closing(Processes(work, jobs)) as processes:
         yield from processes.run(tasks)
 
 
@@ -79,34 +80,26 @@ class Processes(Pool):
     """Processes of this machine, each ready for one kind of work."""
 
     def __init__(
-        self,
-        work: Any,
-        count: int,
-        *,
-        grace_s: float = _GRACE_S,
-        clean: Callable[[], None] | None = None,
-        within: fence.Fence | None = None,
+        self, work: Any, count: int, clean: Callable[[], None] | None = None, within: fence.Fence | None = None
     ) -> None:
         """Take what they need; each is started when it is first asked.
 
         Parameters
         ----------
-        grace_s : float
-            Time for half-written files to be removed in the end.
         clean : callable, optional
-            What they do where this process is killed.
+            Removes the files of all, where this process is killed; who gives it leaves none half written.
         within : Fence, optional
             A fence that they enter; by default this process's own.
         """
-        self.work, self._grace_s, self._closed, self._lock = work, grace_s, False, threading.Lock()
-        self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        self.work, self._closed, self._lock = work, False, threading.Lock()
+        self._grace_s = 0.0 if clean else _GRACE_S
         self.all = [_Process((work, clean, within or fence.current())) for _ in range(count)]
-        for process in self.all:
-            self._idle.put(process)
+        self._idle = deque(self.all)
+        self._threads = ThreadPoolExecutor(count, "roadgeo-pool")  # each has a process while it waits for its result
 
-    def busy(self) -> int:
-        """Return how many tasks keep them busy: each has one, and the next one waits."""
-        return 2 * len(self.all)
+    def count(self) -> int:
+        """Return how many there are."""
+        return len(self.all)
 
     def wait_until_ready(self) -> None:
         """Wait until all have prepared.
@@ -116,31 +109,39 @@ class Processes(Pool):
         RoadgeoError
             One cannot be started, or ends; or what the first raised that could not prepare.
         """
-        lost = [self._start(process) for process in self.all]
-        ready = [process.ask(None, 0.0, say_nothing, threading.Event()) for process in self.all if not any(lost)]
-        for each in filter(None, lost + ready):
-            raise RoadgeoError(f"a process ended before it was ready: {each.said}")
+        for future in [self.submit(None, 0.0, say_nothing, threading.Event()) for _ in self.all]:
+            if isinstance(lost := future.result(), Lost):
+                raise RoadgeoError(f"a process ended before it was ready: {lost.said}")
 
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Have the next one that is free do a task. One that has no result for it is started anew."""
-        while True:
-            with contextlib.suppress(queue.Empty):
-                process = self._idle.get(timeout=_GLANCE_S)
-                break
+    def submit(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Future[Any]:
+        """Have the next one that is free do a task."""
+        return self._threads.submit(self._ask, task, patience_s, say, called_off)
+
+    def result(self, future: Future[Any], called_off: threading.Event) -> Any:
+        """Wait for the result of a task; once it is called off for no process."""
+        while not future.done():
+            wait([future], _GLANCE_S)
             if called_off.is_set():
-                return _CALLED_OFF
+                future.cancel()
+        return _CALLED_OFF if future.cancelled() else future.result()
+
+    def _ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+        """Have a process do a task. One that has no result for it is started anew."""
+        if called_off.is_set():
+            return _CALLED_OFF
+        process, kind = self._idle.popleft(), "lost"
         try:
-            if called_off.is_set():
-                return _CALLED_OFF
-            if lost := self._start(process):
-                return lost
-            result = process.ask(task, patience_s, say, called_off)
-            if isinstance(result, Lost):
+            result: Any = self._start(process)
+            if result is None:
+                kind, result = process.ask(task, patience_s, say, called_off)
+        finally:
+            if kind == "lost":
                 process.end(0.0)
                 self._start(process)
-            return result
-        finally:
-            self._idle.put(process)
+            self._idle.append(process)
+        if kind == "failed":
+            raise result
+        return result
 
     def _start(self, process: _Process) -> Lost | None:
         """Start a process that has ended, unless all are to end."""
@@ -182,9 +183,8 @@ class _Process:
         """
         if self.process is not None:
             return
-        # A fork server loads the libraries once for all; elsewhere each process starts afresh.
-        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-        context: Any = multiprocessing.get_context(method)
+        # A fork server loads the libraries once for all; on Windows each process starts afresh.
+        context: Any = multiprocessing.get_context("spawn" if os.name == "nt" else "forkserver")
         context.set_forkserver_preload(_PRELOAD)
         self._pipe, theirs = context.Pipe()
         with theirs:
@@ -193,35 +193,31 @@ class _Process:
                 process.start()
         self.process, self._start_s = process, _START_S
 
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
-        """Return the result of a task, or why it is lost, or raise what it raised.
+    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> tuple[str, Any]:
+        """Return "done" and the result of a task, "failed" and what it raised, or "lost" and why.
 
         The first one waits until the process has prepared.
         """
-        patience_s, kind = patience_s + self._start_s, ""
+        patience_s += self._start_s
         until = time.monotonic() + patience_s
-        while kind not in ("done", "failed"):
-            left = until - time.monotonic()
-            if called_off.is_set():
-                return _CALLED_OFF
-            if left <= 0.0:
-                return Lost("late", f"longer than {patience_s:g} s")
-            try:
-                if not kind:
-                    self._pipe.send(task)
-                kind, said = self._pipe.recv() if self._pipe.poll(min(_GLANCE_S, left)) else _WAITING
-            except (EOFError, OSError):
-                return Lost("died", "the process that worked on it died (out of memory?)")
+        for kind, said in self._answers(task):
             if kind == "told":
-                try:
-                    say(*said)
-                except BaseException:
-                    self.end(0.0)  # its answer would be taken for the next task's
-                    raise
-        self._start_s = 0.0
-        if kind == "failed":
-            raise said
-        return said
+                say(*said)
+            elif kind != "waiting":
+                self._start_s = 0.0
+                return kind, said
+            if called_off.is_set():
+                return "lost", _CALLED_OFF
+            if time.monotonic() > until:
+                return "lost", Lost("late", f"longer than {patience_s:g} s")
+        return "lost", Lost("died", "the process that worked on it died (out of memory?)")
+
+    def _answers(self, task: Any) -> Iterator[tuple[str, Any]]:
+        """Send a task, and yield what comes back, or that it waits, as long as the process lives."""
+        with contextlib.suppress(EOFError, OSError):
+            self._pipe.send(task)
+            while True:
+                yield self._pipe.recv() if self._pipe.poll(_GLANCE_S) else ("waiting", None)
 
     def end(self, grace_s: float) -> None:
         """End it, at once or after a time in which it may clean up."""
@@ -250,25 +246,42 @@ def _serve(
     clean: Callable[[], None] | None,
     within: fence.Fence | None,
 ) -> None:
-    """Do tasks until the pipe is closed. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
+    """Do tasks until it is told to end. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(pipe, tasks, clean), daemon=True).start()  # it stays outside the fence
     try:
-        _end_with_parent(clean)
         enter(within)  # the fork server may be older than the fence
         _log.setLevel(level)
         _parents[:] = [pipe]
         kind, do = _reply(work.prepare)
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                task = pipe.recv()
-                pipe.send((kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task))
-        if clean is not None:  # the thread that watches the parent is outside the fence: it cleans, and ends this one
-            time.sleep(_GRACE_S)
+        while True:
+            task = tasks.get()
+            answer = (kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task)
+            with contextlib.suppress(OSError):  # the parent is gone
+                pipe.send(answer)
     except SystemExit:  # the task has cleaned up
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is on its way
         remove_own()
         os._exit(128 + signal.SIGTERM)
+
+
+def _receive(pipe: Connection, tasks: queue.SimpleQueue[Any], clean: Callable[[], None] | None) -> None:
+    """Take tasks, and end this process when the one that started it is gone, however it went.
+
+    It does the remaining work of the parent (`clean`), and ends the main thread first (SIGTERM), so that it may remove
+    half-written files.
+    """
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            tasks.put(pipe.recv())
+    if clean is not None:
+        clean()
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+        time.sleep(_GRACE_S)
+    os._exit(1)
 
 
 def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
@@ -304,27 +317,13 @@ def _end_with_parent(clean: Callable[[], None] | None) -> None:
 
 @contextlib.contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C from processes that are started meanwhile: it reaches them before they can ignore it.
-
-    To this process it comes afterwards, and so does SIGTERM: one that is half started is known to nobody who ends it.
-    """
+    """Keep Ctrl-C from processes that are started meanwhile: it reaches them before they can ignore it."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
     resource_tracker.ensure_running()  # which every first child starts, and which takes the block away
-    came: list[int] = []
-    kept = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) is not None:
-                kept[number] = signal.signal(number, lambda number, _: came.append(number))
-    # Children inherit what this thread blocks. Other threads may take the signal all the same, hence the handlers.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for number, handler in kept.items():
-            signal.signal(number, handler)
-    for each in dict.fromkeys(came):
-        signal.raise_signal(each)

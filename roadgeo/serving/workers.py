@@ -114,7 +114,7 @@ class ImageWorkers:
         own = self._temporary.name
         within = fence and replace(fence, write=(*fence.write, own), temporary=own)
         work = Serving(tuple(references), threads)
-        self._processes = Processes(work, count, grace_s=0.0, clean=clean, within=within)
+        self._processes = Processes(work, count, clean, within)
         self._places = threading.Semaphore(count + waiting)
         try:
             self._processes.wait_until_ready()

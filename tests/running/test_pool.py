@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ GIVE_UP = SimpleNamespace(give_up=lambda task, lost: f"{task}: {lost.said}")
 class Toys(Pool):
     """Workers that answer with the task; `deaths` says how often they die of which."""
 
-    count: int = 2
+    workers: int = 2
     deaths: dict[int, int] = field(default_factory=dict)
     slow: int = -1
     begun: list[int] = field(default_factory=list)
@@ -29,10 +30,19 @@ class Toys(Pool):
 
     work = GIVE_UP
 
-    def busy(self) -> int:
-        return self.count
+    def __post_init__(self):
+        self.threads = ThreadPoolExecutor(self.workers)
 
-    def ask(self, task, **_):
+    def count(self) -> int:
+        return self.workers
+
+    def submit(self, task, *_):
+        return self.threads.submit(self.ask, task)
+
+    def result(self, future, *_):
+        return future.result()
+
+    def ask(self, task):
         self.begun.append(task)
         self.inside += 1
         self.beside[task] = self.inside
@@ -70,7 +80,7 @@ def test_a_slow_task_stops_no_other_and_results_that_wait_are_bounded() -> None:
 
 def test_what_a_task_raises_is_raised_and_no_other_begins() -> None:
     toys = Toys()
-    toys.ask = lambda task, **_: toys.begun.append(task) or 1 / 0
+    toys.ask = lambda task: toys.begun.append(task) or 1 / 0
     with pytest.raises(ZeroDivisionError):
         list(toys.run(range(200)))
     assert len(toys.begun) <= 32
@@ -111,7 +121,7 @@ class _OddError(Exception):
 
 @pytest.fixture(scope="module")
 def pool():
-    processes = Processes(Tasks(), 1, grace_s=0.0)
+    processes = Processes(Tasks(), 1)
     yield processes
     processes.close()
 
@@ -149,11 +159,11 @@ def test_who_is_called_off_does_not_wait_for_a_process(pool: Pool) -> None:
     called_off, ends = threading.Event(), threading.Event()
     beside = threading.Thread(target=done, args=(pool, "wait"), kwargs={"called_off": ends})
     beside.start()
-    while not pool._idle.empty():
+    while pool._idle:
         time.sleep(0.01)
     threading.Timer(0.1, called_off.set).start()
     assert done(pool, "", called_off=called_off).why == "called off"
-    assert pool._idle.empty()
+    assert not pool._idle
     ends.set()
     beside.join()
 
@@ -166,7 +176,7 @@ def test_who_fails_to_hear_the_progress_leaves_no_answer_to_the_next(pool: Pool)
 
 
 def test_processes_that_cannot_prepare_say_why() -> None:
-    processes = Processes(Tasks(prepares=False), 1, grace_s=0.0)
+    processes = Processes(Tasks(prepares=False), 1)
     for _ in range(2):
         with pytest.raises(RoadgeoError, match="no map"):
             done(processes, "")

@@ -142,7 +142,7 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
 
 def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
     def broken(self, *_):
-        return Lost("died", "it died")
+        return "lost", Lost("died", "it died")
 
     workers, request = one_worker
     with monkeypatch.context() as patch:
