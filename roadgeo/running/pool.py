@@ -13,14 +13,14 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Literal, Protocol, TypeVar
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.storage.fence import Fence, is_started_inside
 
-__all__ = ["Lost", "Pool", "Work", "enter"]
+__all__ = ["PATIENT", "Asker", "Lost", "Pool", "Work", "enter"]
 
 TaskIn = TypeVar("TaskIn", contravariant=True)
 ResultOut = TypeVar("ResultOut", covariant=True)
@@ -55,6 +55,29 @@ class Lost:
     said: str
 
 
+@dataclass(frozen=True)
+class Asker:
+    """Who waits for results.
+
+    Attributes
+    ----------
+    patience_s : float
+        Time for each task; a worker that takes longer is ended.
+    say
+        Called with the progress.
+    called_off : Event
+        Once it is set nobody waits any more.
+    """
+
+    patience_s: float = math.inf
+    say: Say = say_nothing
+    called_off: threading.Event = field(default_factory=threading.Event)
+
+
+#: Waits as long as it takes.
+PATIENT = Asker()
+
+
 class Pool(ABC):
     """Workers that are ready for one kind of work; may be asked from several threads.
 
@@ -70,44 +93,28 @@ class Pool(ABC):
         """Return how many workers there are; they may come and go."""
 
     @abstractmethod
-    def submit(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+    def submit(self, task: Any, asker: Asker) -> Any:
         """Have one do a task, and return its future."""
 
     @abstractmethod
-    def result(self, future: Any, called_off: threading.Event) -> Any:
+    def result(self, future: Any, asker: Asker) -> Any:
         """Wait for the result of a task, and return it, or why it is lost; raises what the task raised."""
 
-    def run(
-        self,
-        tasks: Sequence[Any],
-        patience_s: float = math.inf,
-        say: Say = say_nothing,
-        called_off: threading.Event | None = None,
-    ) -> Iterator[Any]:
+    def run(self, tasks: Sequence[Any], asker: Asker = PATIENT) -> Iterator[Any]:
         """Do all tasks and yield their results in order, each as soon as it and those before it are there.
 
         Those that were submitted go on until the workers are ended.
-
-        Parameters
-        ----------
-        patience_s : float
-            Time for each task; a worker that takes longer is ended.
-        say
-            Called with the progress.
-        called_off : Event, optional
-            Once it is set nobody waits for the results any more.
         """
-        called_off = called_off or threading.Event()
         waiting, begun = iter(tasks), deque[Any]()
         for task in tasks:
             more = islice(waiting, max(_UNREAD * self.count() - len(begun), not begun))
-            begun.extend(self.submit(each, patience_s, say, called_off) for each in more)
-            result = self.result(begun.popleft(), called_off)
+            begun.extend(self.submit(each, asker) for each in more)
+            result = self.result(begun.popleft(), asker)
             if isinstance(result, Lost) and result.why == "died":
                 with suppress(Exception):  # each is raised in its turn
                     for other in begun:
-                        self.result(other, called_off)
-                result = self.result(self.submit(task, patience_s, say, called_off), called_off)
+                        self.result(other, asker)
+                result = self.result(self.submit(task, asker), asker)
             yield self.work.give_up(task, result) if isinstance(result, Lost) else result
 
 

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import pickle
 import queue
+import shutil
 import signal
 import sys
 import threading
@@ -21,9 +22,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Lost, Pool, Work, enter
+from roadgeo.running.pool import PATIENT, Asker, Lost, Pool, Work, enter
 from roadgeo.storage import fence
 from roadgeo.storage.files import remove_own
 
@@ -79,21 +79,19 @@ def _require_guard() -> None:
 class Processes(Pool):
     """Processes of this machine, each ready for one kind of work."""
 
-    def __init__(
-        self, work: Any, count: int, clean: Callable[[], None] | None = None, within: fence.Fence | None = None
-    ) -> None:
+    def __init__(self, work: Any, count: int, folder: str = "", within: fence.Fence | None = None) -> None:
         """Take what they need; each is started when it is first asked.
 
         Parameters
         ----------
-        clean : callable, optional
-            Removes the files of all, where this process is killed; who gives it leaves none half written.
+        folder : str
+            Holds all files that they write, for this process to remove; they do it where it is killed.
         within : Fence, optional
             A fence that they enter; by default this process's own.
         """
         self.work, self._closed, self._lock = work, False, threading.Lock()
-        self._grace_s = 0.0 if clean else _GRACE_S
-        self.all = [_Process((work, clean, within or fence.current())) for _ in range(count)]
+        self._grace_s = 0.0 if folder else _GRACE_S
+        self.all = [_Process((work, folder, within or fence.current())) for _ in range(count)]
         self._idle = deque(self.all)
         self._threads = ThreadPoolExecutor(count, "roadgeo-pool")  # each has a process while it waits for its result
 
@@ -109,31 +107,31 @@ class Processes(Pool):
         RoadgeoError
             One cannot be started, or ends; or what the first raised that could not prepare.
         """
-        for future in [self.submit(None, 0.0, say_nothing, threading.Event()) for _ in self.all]:
+        for future in [self.submit(None, PATIENT) for _ in self.all]:
             if isinstance(lost := future.result(), Lost):
                 raise RoadgeoError(f"a process ended before it was ready: {lost.said}")
 
-    def submit(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Future[Any]:
+    def submit(self, task: Any, asker: Asker) -> Future[Any]:
         """Have the next one that is free do a task."""
-        return self._threads.submit(self._ask, task, patience_s, say, called_off)
+        return self._threads.submit(self._ask, task, asker)
 
-    def result(self, future: Future[Any], called_off: threading.Event) -> Any:
+    def result(self, future: Future[Any], asker: Asker) -> Any:
         """Wait for the result of a task; once it is called off for no process."""
         while not future.done():
             wait([future], _GLANCE_S)
-            if called_off.is_set():
+            if asker.called_off.is_set():
                 future.cancel()
         return _CALLED_OFF if future.cancelled() else future.result()
 
-    def _ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> Any:
+    def _ask(self, task: Any, asker: Asker) -> Any:
         """Have a process do a task. One that has no result for it is started anew."""
-        if called_off.is_set():
+        if asker.called_off.is_set():
             return _CALLED_OFF
         process, kind = self._idle.popleft(), "lost"
         try:
             result: Any = self._start(process)
             if result is None:
-                kind, result = process.ask(task, patience_s, say, called_off)
+                kind, result = process.ask(task, asker)
         finally:
             if kind == "lost":
                 process.end(0.0)
@@ -146,21 +144,14 @@ class Processes(Pool):
     def _start(self, process: _Process) -> Lost | None:
         """Start a process that has ended, unless all are to end."""
         with self._lock:
-            if self._closed:
-                return Lost("no worker", "it is ending")
-            try:
-                process.start()
-            except OSError as error:
-                return Lost("no worker", f"no process can be started: {error.strerror or error}")
-            return None
+            return Lost("no worker", "it is ending") if self._closed else process.start()
 
     def close(self) -> None:
         """End all."""
         with self._lock:
             self._closed = True
-            started = [process.process for process in self.all if process.process is not None]
-            for process in started:
-                process.terminate()
+            for started in filter(None, [process.process for process in self.all]):
+                started.terminate()
             until = time.monotonic() + self._grace_s
             for process in self.all:
                 process.end(until - time.monotonic())
@@ -173,40 +164,37 @@ class _Process:
     given: tuple[Any, ...]
     process: Any = None
 
-    def start(self) -> None:
-        """Start it where it is not.
-
-        Raises
-        ------
-        OSError
-            The system has no room for it.
-        """
+    def start(self) -> Lost | None:
+        """Start it where it is not, and the system has room for it."""
         if self.process is not None:
-            return
+            return None
         # A fork server loads the libraries once for all; on Windows each process starts afresh.
         context: Any = multiprocessing.get_context("spawn" if os.name == "nt" else "forkserver")
         context.set_forkserver_preload(_PRELOAD)
-        self._pipe, theirs = context.Pipe()
-        with theirs:
+        try:
+            self._pipe, theirs = context.Pipe()
             process = context.Process(target=_serve, args=(theirs, _log.level, *self.given), daemon=True)
-            with without_interrupts():
+            with theirs, without_interrupts():
                 process.start()
+        except OSError as error:
+            return Lost("no worker", f"no process can be started: {error.strerror or error}")
         self.process, self._start_s = process, _START_S
+        return None
 
-    def ask(self, task: Any, patience_s: float, say: Say, called_off: threading.Event) -> tuple[str, Any]:
+    def ask(self, task: Any, asker: Asker) -> tuple[str, Any]:
         """Return "done" and the result of a task, "failed" and what it raised, or "lost" and why.
 
         The first one waits until the process has prepared.
         """
-        patience_s += self._start_s
+        patience_s = self._start_s + asker.patience_s
         until = time.monotonic() + patience_s
         for kind, said in self._answers(task):
             if kind == "told":
-                say(*said)
+                asker.say(*said)
             elif kind != "waiting":
                 self._start_s = 0.0
                 return kind, said
-            if called_off.is_set():
+            if asker.called_off.is_set():
                 return "lost", _CALLED_OFF
             if time.monotonic() > until:
                 return "lost", Lost("late", f"longer than {patience_s:g} s")
@@ -239,18 +227,12 @@ def tell(text: str, share: float | None = None) -> None:
         pipe.send(("told", (text, share)))
 
 
-def _serve(
-    pipe: Connection,
-    level: int,
-    work: Any,
-    clean: Callable[[], None] | None,
-    within: fence.Fence | None,
-) -> None:
+def _serve(pipe: Connection, level: int, work: Any, folder: str, within: fence.Fence | None) -> None:
     """Do tasks until it is told to end. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(pipe, tasks, clean), daemon=True).start()  # it stays outside the fence
+    threading.Thread(target=_receive, args=(pipe, tasks, folder), daemon=True).start()  # it stays outside the fence
     try:
         enter(within)  # the fork server may be older than the fence
         _log.setLevel(level)
@@ -267,17 +249,16 @@ def _serve(
         os._exit(128 + signal.SIGTERM)
 
 
-def _receive(pipe: Connection, tasks: queue.SimpleQueue[Any], clean: Callable[[], None] | None) -> None:
+def _receive(pipe: Connection, tasks: queue.SimpleQueue[Any], folder: str) -> None:
     """Take tasks, and end this process when the one that started it is gone, however it went.
 
-    It does the remaining work of the parent (`clean`), and ends the main thread first (SIGTERM), so that it may remove
-    half-written files.
+    The parent's folder is removed, and the main thread ended first (SIGTERM), that it may remove half-written files.
     """
     with contextlib.suppress(EOFError, OSError):
         while True:
             tasks.put(pipe.recv())
-    if clean is not None:
-        clean()
+    if folder:
+        shutil.rmtree(folder, ignore_errors=True)
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
         time.sleep(_GRACE_S)

@@ -6,7 +6,6 @@ nobody an answer, unless the next one breaks by the same image.
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -21,7 +20,7 @@ from starlette.exceptions import HTTPException
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import log_of
 from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
-from roadgeo.running.pool import Lost
+from roadgeo.running.pool import Asker, Lost
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
 
@@ -109,12 +108,10 @@ class ImageWorkers:
             A reference cannot be opened.
         """
         self._temporary = TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True)
-        self.folder = Path(self._temporary.name)
-        clean = partial(shutil.rmtree, self.folder, ignore_errors=True)
         own = self._temporary.name
+        self.folder = Path(own)
         within = fence and replace(fence, write=(*fence.write, own), temporary=own)
-        work = Serving(tuple(references), threads)
-        self._processes = Processes(work, count, clean, within)
+        self._processes = Processes(Serving(tuple(references), threads), count, own, within)
         self._places = threading.Semaphore(count + waiting)
         try:
             self._processes.wait_until_ready()
@@ -147,11 +144,12 @@ class ImageWorkers:
             Once it is set nobody waits for the answer any more.
         """
         patience_s = request.time_limit_s + (_PATIENT_S if request.keeps else _GRACE_S)
+        asker = Asker(patience_s, say, called_off or threading.Event())
         try:
-            replies: list[Reply] = list(self._processes.run([request], patience_s, say, called_off))
+            reply: Reply = next(self._processes.run([request], asker))
         except RoadgeoError as error:  # a process that was started anew cannot open the references any more
             return Reply(503, {"detail": str(error)})
-        return replies[0]
+        return reply
 
     def close(self) -> None:
         """End all processes."""

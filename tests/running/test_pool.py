@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import Lost, Pool
+from roadgeo.running.pool import Asker, Lost, Pool
 from roadgeo.running.processes import Processes, tell
 
 GIVE_UP = SimpleNamespace(give_up=lambda task, lost: f"{task}: {lost.said}")
@@ -127,7 +127,7 @@ def pool():
 
 
 def done(pool: Pool, task: str, *how: object, **more: object) -> object:
-    (result,) = pool.run([task], *how, **more)
+    (result,) = pool.run([task], Asker(*how, **more))
     return result
 
 
