@@ -18,7 +18,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from roadgeo.errors import RoadgeoError, how_to_install
 from roadgeo.running.pool import Lost, Pool, Work, enter
@@ -110,7 +110,7 @@ class DaskWorkers(Pool):
     def __init__(self, client: Any, work: Any) -> None:
         """Take them as Dask's client knows them."""
         self.work, self._client = work, client
-        self._made = Made(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work), current())
+        self._made = (uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work), current())
 
     def names(self) -> list[str]:
         """Return their addresses, in order; at least one."""
@@ -156,26 +156,18 @@ class DaskWorkers(Pool):
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
 
-class Made(NamedTuple):
-    """Work on its way to the workers: a name for it, the folder that it was asked for in, itself, and its fence."""
-
-    token: str
-    folder: str
-    pickled: bytes
-    fence: Fence | None
-
-
-def do_prepared(made: Made, task: Any) -> Any:
+def do_prepared(made: tuple[str, str, bytes, Fence | None], task: Any) -> Any:
     """Do a task in the folder where it was asked for; make its work and this worker ready first, once.
 
-    A worker outlives the work. So a thread of its own does it, inside the fence of whoever asked.
+    The work is a name for it, that folder, itself, and its fence. A worker outlives it. So a thread of its own does it,
+    inside the fence of whoever asked.
     """
-    thread, do = _made_ready(made)
+    thread, do = _made_ready(*made)
     return thread.submit(do, task).result()
 
 
 @lru_cache(maxsize=1)
-def _made_ready(made: Made) -> tuple[ThreadPoolExecutor, Any]:
+def _made_ready(_: str, folder: str, pickled: bytes, fence: Fence | None) -> tuple[ThreadPoolExecutor, Any]:
     from distributed import Lock
 
     from roadgeo.kernels.warmup import warm_up
@@ -184,11 +176,11 @@ def _made_ready(made: Made) -> tuple[ThreadPoolExecutor, Any]:
     with Lock(f"roadgeo: kernels of {socket.gethostname()}"):  # others wait for the files of the one that compiles
         warm_up()
     thread = ThreadPoolExecutor(1)
-    return thread, thread.submit(_prepare, made).result()
+    return thread, thread.submit(_prepare, folder, pickled, fence).result()
 
 
-def _prepare(made: Made) -> Any:
+def _prepare(folder: str, pickled: bytes, fence: Fence | None) -> Any:
     """Make work ready on the thread that will do it."""
-    os.chdir(made.folder)
-    enter(made.fence)
-    return pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
+    os.chdir(folder)
+    enter(fence)
+    return pickle.loads(pickled).prepare()  # noqa: S301 (from our own client)
