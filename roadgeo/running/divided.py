@@ -32,7 +32,7 @@ from roadgeo.matching.triples import larger
 from roadgeo.matching.verdict import decide
 from roadgeo.matching.veto import contest
 from roadgeo.reference.opening import open_references
-from roadgeo.reference.shards import ShardedReference
+from roadgeo.reference.shards import Shard
 from roadgeo.running.cluster import Cluster, DaskWorkers
 from roadgeo.running.locating import Locating, Outcome
 from roadgeo.running.pool import Lost
@@ -100,20 +100,13 @@ def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> 
 
 
 def _parts_of(references: Sequence[AnyReference]) -> dict[str, Part]:
-    """Return all parts by their names: the number of the reference, and of a sharded one the shard."""
-    named: dict[str, Part] = {}
-    for k, reference in enumerate(references):
-        if isinstance(reference, ShardedReference):
-            named.update({f"{k}/{part.entry.name}": part for part in reference.parts})
-        else:
-            named[f"{k}/"] = reference.parts[0]
-    return named
+    """Return all parts by their names: the number of the reference, and that of the part."""
+    return {f"{k}/{n}": part for k, reference in enumerate(references) for n, part in enumerate(reference.parts)}
 
 
 def _size(part: Part) -> int:
     """Return how many intersections a part has; a shard is not opened."""
-    entry = getattr(part, "entry", None)
-    return len(part.open()) if entry is None else int(entry.own_intersections)
+    return part.entry.own_intersections if isinstance(part, Shard) else len(part.open())
 
 
 def _locate(
