@@ -145,7 +145,7 @@ class Service:
     def _start(self, job: Job, came: float, location: str) -> Response:
         """Locate while nobody waits."""
         place = self.workers.take_place()
-        self._jobs.add(job)
+        self._jobs[job.id] = job
         task = asyncio.get_running_loop().create_task(self._work(job, place, came))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -166,7 +166,7 @@ class Service:
     # --- jobs ---------------------------------------------------------------------------------------------------------
 
     def _find(self, request: Request) -> Job:
-        return self._jobs.find(request.path_params["job"])
+        return self._jobs[request.path_params["job"]]
 
     async def _job(self, request: Request) -> Response:
         return JSONResponse(self._find(request).to_dict())

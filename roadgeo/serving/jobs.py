@@ -100,12 +100,12 @@ class Job:
         yield self.to_dict()
 
 
-class Jobs:
-    """All jobs; of those that are over the latest are kept."""
+class Jobs(dict[str, Job]):
+    """All jobs by their names; of those that are over the latest are kept."""
 
     def __init__(self, folder: Path, options: ServeOptions) -> None:
+        super().__init__()
         self._folder, self._options = folder, options
-        self._all: dict[str, Job] = {}
 
     @contextmanager
     def room(self) -> Iterator[Path]:
@@ -126,34 +126,28 @@ class Jobs:
                 self.make_room()
             raise HTTPException(503, f"the image cannot be kept: {error.strerror or error}; come again") from error
         finally:
-            if folder.name not in self._all:
+            if folder.name not in self:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def add(self, job: Job) -> None:
-        """Keep a job."""
-        self._all[job.id] = job
-
-    def find(self, name: str) -> Job:
-        """Return a job by its name.
+    def __missing__(self, name: str) -> Job:
+        """Refuse a name that no job has.
 
         Raises
         ------
         HTTPException
-            There is no such job.
+            Always.
         """
-        if name not in self._all:
-            raise HTTPException(404, f"there is no such job; the latest {self._options.kept_jobs} are kept")
-        return self._all[name]
+        raise HTTPException(404, f"there is no such job; the latest {self._options.kept_jobs} are kept")
 
     def remove(self, job: Job) -> None:
         """Call a job off, and forget it."""
         job.call_off()
-        self._all.pop(job.id, None)
+        self.pop(job.id, None)
         shutil.rmtree(job.folder, ignore_errors=True)
 
     def make_room(self) -> None:
         """Forget the oldest that is over: the disk is full."""
-        oldest = next((job for job in self._all.values() if job.answer is not None), None)
+        oldest = next((job for job in self.values() if job.answer is not None), None)
         if oldest is not None:
             self.remove(oldest)
 
@@ -162,14 +156,12 @@ class Jobs:
 
         Nothing is kept on disk of jobs that failed.
         """
-        over = [job for job in self._all.values() if job.answer is not None]
+        over, most = [job for job in self.values() if job.answer is not None], self._options
         for job in over:
             if job.status == "failed":
                 shutil.rmtree(job.folder, ignore_errors=True)
-        sizes = [_size(job.folder) for job in over]
-        while over and (len(over) > self._options.kept_jobs or (sum(sizes) > self._options.kept_bytes and over[1:])):
+        while len(over) > most.kept_jobs or (over[1:] and sum(_size(job.folder) for job in over) > most.kept_bytes):
             self.remove(over.pop(0))
-            sizes.pop(0)
 
 
 def _size(folder: Path) -> int:
