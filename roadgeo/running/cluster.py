@@ -18,17 +18,14 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from roadgeo.errors import RoadgeoError, how_to_install
-from roadgeo.running.pool import Lost, Pool, Work, enter
+from roadgeo.running.pool import Lost, Pool, ResultOut, TaskIn, Work, enter
 from roadgeo.running.processes import without_interrupts
 from roadgeo.storage.fence import Fence, current
 
 __all__ = ["Cluster", "DaskWorkers"]
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
@@ -60,7 +57,7 @@ class Cluster:
     workers: int = 1
     divide_map: bool = False
 
-    def run(self, tasks: Sequence[Task], work: Work[Task, Result]) -> Iterator[Result]:
+    def run(self, tasks: Sequence[TaskIn], work: Work[TaskIn, ResultOut]) -> Iterator[ResultOut]:
         """Do all tasks and yield their results in the order of the tasks.
 
         Raises

@@ -20,7 +20,7 @@ from typing import Any, Literal, Protocol, TypeVar
 from roadgeo._progress import Say, say_nothing
 from roadgeo.storage.fence import Fence, is_started_inside
 
-__all__ = ["PATIENT", "Asker", "Lost", "Pool", "Work", "enter"]
+__all__ = ["Asker", "Lost", "Pool", "ResultOut", "TaskIn", "Work", "enter"]
 
 TaskIn = TypeVar("TaskIn", contravariant=True)
 ResultOut = TypeVar("ResultOut", covariant=True)
@@ -75,7 +75,7 @@ class Asker:
 
 
 #: Waits as long as it takes.
-PATIENT = Asker()
+_PATIENT = Asker()
 
 
 class Pool(ABC):
@@ -100,7 +100,7 @@ class Pool(ABC):
     def result(self, future: Any, asker: Asker) -> Any:
         """Wait for the result of a task, and return it, or why it is lost; raises what the task raised."""
 
-    def run(self, tasks: Sequence[Any], asker: Asker = PATIENT) -> Iterator[Any]:
+    def run(self, tasks: Sequence[Any], asker: Asker = _PATIENT) -> Iterator[Any]:
         """Do all tasks and yield their results in order, each as soon as it and those before it are there.
 
         Those that were submitted go on until the workers are ended.

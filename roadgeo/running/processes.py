@@ -20,19 +20,16 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.pool import PATIENT, Asker, Lost, Pool, Work, enter
+from roadgeo.running.pool import Asker, Lost, Pool, ResultOut, TaskIn, Work, enter
 from roadgeo.storage import fence
 from roadgeo.storage.files import remove_own
 
 __all__ = ["Processes", "run", "tell", "without_interrupts"]
 
 _log = logging.getLogger("roadgeo")  # of all modules
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
 
 #: Modules that nearly every task needs: a fork server loads them once for all processes.
 _PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"]
@@ -46,7 +43,7 @@ _GLANCE_S = 0.25
 _CALLED_OFF = Lost("called off", "it was called off")
 
 
-def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
+def run(tasks: Sequence[TaskIn], work: Work[TaskIn, ResultOut], jobs: int) -> Iterator[ResultOut]:
     """Do all tasks in one process or several, and yield their results in the order of the tasks.
 
     A process that dies (out of memory, a crash in a library) costs one result, not the others.
@@ -107,7 +104,7 @@ class Processes(Pool):
         RoadgeoError
             One cannot be started, or ends; or what the first raised that could not prepare.
         """
-        for future in [self.submit(None, PATIENT) for _ in self.all]:
+        for future in [self.submit(None, Asker(0.0)) for _ in self.all]:
             if isinstance(lost := future.result(), Lost):
                 raise RoadgeoError(f"a process ended before it was ready: {lost.said}")
 
