@@ -185,24 +185,18 @@ class _Process:
         """
         patience_s = self._start_s + asker.patience_s
         until = time.monotonic() + patience_s
-        for kind, said in self._answers(task):
-            if kind == "told":
-                asker.say(*said)
-            elif kind != "waiting":
-                self._start_s = 0.0
-                return kind, said
-            if asker.called_off.is_set():
-                return "lost", _CALLED_OFF
-            if time.monotonic() > until:
-                return "lost", Lost("late", f"longer than {patience_s:g} s")
-        return "lost", Lost("died", "the process that worked on it died (out of memory?)")
-
-    def _answers(self, task: Any) -> Iterator[tuple[str, Any]]:
-        """Send a task, and yield what comes back, or that it waits, as long as the process lives."""
-        with contextlib.suppress(EOFError, OSError):
+        try:
             self._pipe.send(task)
-            while True:
-                yield self._pipe.recv() if self._pipe.poll(_GLANCE_S) else ("waiting", None)
+            while not asker.called_off.is_set() and time.monotonic() < until:
+                if self._pipe.poll(_GLANCE_S):
+                    kind, said = self._pipe.recv()
+                    if kind != "told":
+                        self._start_s = 0.0
+                        return kind, said
+                    asker.say(*said)
+        except (EOFError, OSError):
+            return "lost", Lost("died", "the process that worked on it died (out of memory?)")
+        return "lost", _CALLED_OFF if asker.called_off.is_set() else Lost("late", f"longer than {patience_s:g} s")
 
     def end(self, grace_s: float) -> None:
         """End it, at once or after a time in which it may clean up."""
@@ -228,7 +222,7 @@ def _serve(pipe: Connection, level: int, work: Any, folder: str, within: fence.F
     """Do tasks until it is told to end. Ctrl-C is the parent's to handle: it ends the processes, which clean up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
-    tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(pipe, tasks, folder), daemon=True).start()  # it stays outside the fence
     try:
         enter(within)  # the fork server may be older than the fence
@@ -236,7 +230,7 @@ def _serve(pipe: Connection, level: int, work: Any, folder: str, within: fence.F
         _parents[:] = [pipe]
         kind, do = _reply(work.prepare)
         while True:
-            task = tasks.get()
+            task = pickle.loads(tasks.get())  # noqa: S301 (from the parent)
             answer = (kind, do) if kind == "failed" else ("done", None) if task is None else _reply(do, task)
             with contextlib.suppress(OSError):  # the parent is gone
                 pipe.send(answer)
@@ -246,14 +240,14 @@ def _serve(pipe: Connection, level: int, work: Any, folder: str, within: fence.F
         os._exit(128 + signal.SIGTERM)
 
 
-def _receive(pipe: Connection, tasks: queue.SimpleQueue[Any], folder: str) -> None:
+def _receive(pipe: Connection, tasks: queue.SimpleQueue[bytes], folder: str) -> None:
     """Take tasks, and end this process when the one that started it is gone, however it went.
 
     The parent's folder is removed, and the main thread ended first (SIGTERM), that it may remove half-written files.
     """
     with contextlib.suppress(EOFError, OSError):
         while True:
-            tasks.put(pipe.recv())
+            tasks.put(pipe.recv_bytes())
     if folder:
         shutil.rmtree(folder, ignore_errors=True)
     if hasattr(signal, "pthread_kill"):

@@ -175,6 +175,18 @@ def test_who_fails_to_hear_the_progress_leaves_no_answer_to_the_next(pool: Pool)
         done(pool, "fail")
 
 
+class _Unreadable:
+    """Cannot be read by another process."""
+
+    def __reduce__(self) -> object:
+        return int, ("none",)
+
+
+def test_a_task_that_a_process_cannot_read_is_lost(pool: Pool) -> None:
+    assert done(pool, _Unreadable()).why == "died"
+    assert done(pool, "")
+
+
 def test_processes_that_cannot_prepare_say_why() -> None:
     processes = Processes(Tasks(prepares=False), 1)
     for _ in range(2):
