@@ -250,9 +250,8 @@ def _receive(pipe: Connection, tasks: queue.SimpleQueue[bytes], folder: str) -> 
             tasks.put(pipe.recv_bytes())
     if folder:
         shutil.rmtree(folder, ignore_errors=True)
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
-        time.sleep(_GRACE_S)
+    os.kill(os.getpid(), signal.SIGTERM)  # on Windows it ends all at once
+    time.sleep(_GRACE_S)
     os._exit(1)
 
 
@@ -264,27 +263,6 @@ def _reply(do: Callable[..., Any], *task: Any) -> tuple[str, Any]:
         with contextlib.suppress(Exception):
             return "failed", pickle.loads(pickle.dumps(error))  # noqa: S301 (from ourselves)
         return "failed", RuntimeError(f"{type(error).__name__}: {error}")
-
-
-def _end_with_parent(clean: Callable[[], None] | None) -> None:
-    """End this process when the one that started it is gone, however it went: nobody waits for its results.
-
-    It does the remaining work of the parent (`clean`), and ends its main thread first (SIGTERM), so that it
-    may remove half-written files.
-    """
-    parent: Any = multiprocessing.parent_process()
-    main = threading.main_thread().ident or 0
-
-    def watch() -> None:
-        parent.join()
-        if clean is not None:
-            clean()
-        if hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(main, signal.SIGTERM)
-            time.sleep(_GRACE_S)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager
