@@ -40,7 +40,7 @@ _GRACE_S = 5.0
 _START_S = 120.0
 #: Interval of checks whether somebody still waits.
 _GLANCE_S = 0.25
-_CALLED_OFF = Lost("called off", "it was called off")
+_CALLED_OFF, _ENDING = Lost("called off", "it was called off"), Lost("no worker", "it is ending")
 
 
 def run(tasks: Sequence[TaskIn], work: Work[TaskIn, ResultOut], jobs: int) -> Iterator[ResultOut]:
@@ -104,16 +104,21 @@ class Processes(Pool):
         RoadgeoError
             One cannot be started, or ends; or what the first raised that could not prepare.
         """
-        for future in [self.submit(None, Asker(0.0)) for _ in self.all]:
-            if isinstance(lost := future.result(), Lost):
+        asker = Asker(0.0)
+        for future in [self.submit(None, asker) for _ in self.all]:
+            if isinstance(lost := self.result(future, asker), Lost):
                 raise RoadgeoError(f"a process ended before it was ready: {lost.said}")
 
-    def submit(self, task: Any, asker: Asker) -> Future[Any]:
-        """Have the next one that is free do a task."""
-        return self._threads.submit(self._ask, task, asker)
+    def submit(self, task: Any, asker: Asker) -> Future[Any] | None:
+        """Have the next one that is free do a task, unless all are to end."""
+        with contextlib.suppress(RuntimeError):
+            return self._threads.submit(self._ask, task, asker)
+        return None
 
-    def result(self, future: Future[Any], asker: Asker) -> Any:
+    def result(self, future: Future[Any] | None, asker: Asker) -> Any:
         """Wait for the result of a task; once it is called off for no process."""
+        if future is None:
+            return _ENDING
         while not future.done():
             wait([future], _GLANCE_S)
             if asker.called_off.is_set():
@@ -141,7 +146,7 @@ class Processes(Pool):
     def _start(self, process: _Process) -> Lost | None:
         """Start a process that has ended, unless all are to end."""
         with self._lock:
-            return Lost("no worker", "it is ending") if self._closed else process.start()
+            return _ENDING if self._closed else process.start()
 
     def close(self) -> None:
         """End all."""
@@ -152,6 +157,7 @@ class Processes(Pool):
             until = time.monotonic() + self._grace_s
             for process in self.all:
                 process.end(until - time.monotonic())
+        self._threads.shutdown(wait=False)
 
 
 @dataclass

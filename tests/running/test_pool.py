@@ -187,6 +187,18 @@ def test_a_task_that_a_process_cannot_read_is_lost(pool: Pool) -> None:
     assert done(pool, "")
 
 
+def test_no_thread_is_left_of_a_pool_that_is_closed() -> None:
+    """An interrupt may come while one starts: the program would wait for it in the end."""
+    processes = Processes(Tasks(), 1)
+    assert done(processes, "")
+    others = {thread for thread in threading.enumerate() if thread not in processes._threads._threads}
+    processes.close()
+    until = time.monotonic() + 10.0
+    while set(threading.enumerate()) - others:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
 def test_processes_that_cannot_prepare_say_why() -> None:
     processes = Processes(Tasks(prepares=False), 1)
     for _ in range(2):
