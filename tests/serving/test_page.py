@@ -1,7 +1,6 @@
 """The page in Chromium: pictures are dropped and located, refusals are helped, by mouse, by keys and on a phone."""
 
 import errno
-import json
 import os
 import re
 from contextlib import contextmanager
@@ -213,16 +212,18 @@ def test_every_output_may_be_had(page, served):
     page.click("#files-of summary")
     links = page.locator("#files-of a")
     expect(links.nth(0)).to_be_visible()
-    names = {}
-    for k in range(links.count()):
-        with page.expect_download() as download:
-            links.nth(k).click()
-        names[links.nth(k).inner_text().split("\n")[0]] = download.value
-    assert names["footprint"].suggested_filename == "My_mask_1_footprint.tif"
+    # Not each by a click: in a busy browser the eleventh is now and then not even asked for.
+    names = {
+        link.inner_text().split("\n")[0]: page.request.get(link.evaluate("link => link.href")) for link in links.all()
+    }
+    assert all(answer.ok for answer in names.values())
     assert {"geopackage", "json", "report", "geojson", "kmz", "gcps"} <= set(names)
-    document = json.loads(Path(names["json"].path()).read_text())
+    document = names["json"].json()
     assert (document["status"], document["query"]) == ("located", "My mask (1).png")
-    assert Path(names["footprint"].path()).read_bytes()[:2] == b"II"
+    with page.expect_download() as download:
+        links.nth(list(names).index("footprint")).click()
+    assert download.value.suggested_filename == "My_mask_1_footprint.tif"
+    assert Path(download.value.path()).read_bytes() == names["footprint"].body()
 
 
 def test_a_refusal_is_helped_by_a_circle(page, served, hard):
