@@ -193,7 +193,7 @@ def search_each(
 ) -> None:
     """Search each part as if it were alone, within its own limits, until the answer of one stands out.
 
-    Parts share the work, with that of searches before, as 10 to the power of their `promise`, a log10: a small map does
+    Parts share the work, searches before it included, as 10 to the power of their `promise`, a log10: a small map does
     not wait for large ones, and where an answer shows, its map is searched first. `proves` returns whether a part has
     the answer. It is called when the best model reaches `SearchOptions.accept`, and at the end of each stage. A later
     stage gets a tenth of the work, and ends unless its part `may_go_on`. `heard` is called with each part before its
