@@ -150,7 +150,7 @@ class Rivals:
         accepted = next((part for part in self.estimators if part.stopped == "accepted"), None)
         best = None if accepted is None else self.compare(accepted)
         for part in self.estimators:
-            yield part, best if part is accepted else self.compare(part) if self._may_matter(part, best) else None
+            yield part, self.compare(part) if part is accepted or self._may_matter(part, best) else None
 
     def _may_matter(self, part: Search[Place], best: Place | None) -> bool:
         """Return whether a part has a place that explains nearly as much, by roads or by the picture."""
