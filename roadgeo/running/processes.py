@@ -136,7 +136,8 @@ class Processes(Pool):
                 kind, result = process.ask(task, asker)
         finally:
             if kind == "lost":
-                process.end(0.0)
+                with self._lock:  # who closes the pool meanwhile waits until it has ended
+                    process.end(0.0)
                 self._start(process)
             self._idle.append(process)
         if kind == "failed":

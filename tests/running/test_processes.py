@@ -4,21 +4,23 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
 from support.groups import is_gone
 
-from roadgeo.running.pool import Lost
-from roadgeo.running.processes import run
+from roadgeo.running.pool import Asker, Lost
+from roadgeo.running.processes import Processes, run
 
 
 @dataclass(frozen=True)
 class Shout:
-    """A toy: upper case, slower for earlier tasks; dies at "die"."""
+    """A toy: upper case, slower for "a" and "late"; dies at "die"."""
 
     def prepare(self) -> Callable[[str], str]:
         return self.do
@@ -26,7 +28,7 @@ class Shout:
     def do(self, task: str) -> str:
         if task == "die":
             os._exit(1)
-        time.sleep(0.05 if task == "a" else 0)
+        time.sleep({"a": 0.05, "late": 60}.get(task, 0))
         return task.upper()
 
     def give_up(self, task: str, lost: Lost) -> str:
@@ -54,6 +56,22 @@ def test_who_stops_early_ends_the_workers_and_no_process_of_the_program() -> Non
     finally:
         other.kill()
         other.join()
+
+
+def test_who_closes_waits_for_the_end_of_one_that_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    kill, killed = BaseProcess.kill, threading.Event()
+
+    def kill_late(process: BaseProcess) -> None:
+        killed.set()
+        time.sleep(0.3)
+        kill(process)
+
+    monkeypatch.setattr(BaseProcess, "kill", kill_late)
+    with contextlib.closing(Processes(Shout(), 1)) as processes:
+        processes.wait_until_ready()
+        processes.submit("late", Asker(patience_s=0.1))
+        assert killed.wait(30)
+    assert multiprocessing.active_children() == []
 
 
 _SLOW = """
