@@ -13,6 +13,9 @@ from roadgeo.reference.shards import ShardedReference, manifest_path, open_shard
 
 __all__ = ["AnyReference", "digest_of", "open_reference", "open_references", "swapped_near"]
 
+#: The middle of a frame that shows the edge of a map lies no farther off it than this.
+_BEYOND_M = 3000.0
+
 #: One piece, or shards.
 AnyReference: TypeAlias = Reference | ShardedReference
 
@@ -26,9 +29,12 @@ def digest_of(references: Sequence[AnyReference], name: str) -> str:
 def swapped_near(
     near: tuple[float, float, float], references: Sequence[AnyReference]
 ) -> tuple[float, float, float] | None:
-    """Return a circle (longitude, latitude, metres) the other way round, where only then it touches one of the maps."""
+    """Return a circle (longitude, latitude, metres) the other way round, where only then it touches one of the maps.
+
+    A frame whose middle lies off a map may still show its edge.
+    """
     lon, lat, radius = near
-    if abs(lon) > 90.0 or _touches(near, references):
+    if abs(lon) > 90.0 or _touches((lon, lat, radius + _BEYOND_M), references):
         return None
     return (lat, lon, radius) if _touches((lat, lon, radius), references) else None
 
