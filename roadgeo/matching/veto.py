@@ -28,9 +28,6 @@ __all__ = ["broken_hints", "contest", "without_hints"]
 
 #: A place at the hinted one is another place if it is turned by more, or of a size that a hint tells from it.
 _TURNED_DEG = 45.0
-#: Another place explains more if its log10 likelihood is greater by this. Where streets repeat, places are equal but
-#: for the accuracy of tracing, and it is a hint that separates them: a true one must not lose to the roads' noise.
-_MORE = 0.5
 #: Limit of work for a search without hints where the one with hints found nothing that would be reported, seconds.
 _BRIEFLY_S = 1.0
 
@@ -45,36 +42,49 @@ def without_hints(options: LocateOptions) -> LocateOptions | None:
     return replace(options, near=None, match=replace(options.match, camera=camera, within=None))
 
 
+def _alike(place: Place, free: LocateOptions) -> LocateOptions:
+    """Return options for places of a place's own heading and scale, wherever they are."""
+    scale = place.gsd_m / GSD_FACTOR, place.gsd_m * GSD_FACTOR
+    camera = replace(free.match.camera, heading_deg=(place.view.rotation_deg, _TURNED_DEG), gsd_m=scale)
+    return replace(free, match=replace(free.match, camera=camera))
+
+
 def contest(
     query: Query, hinted: Sequence[Searched], parts: Sequence[Part], options: LocateOptions, time_limit_s: float
 ) -> list[Searched]:
     """Return what a search with hints found; with the place where the roads fit better without them, if there is one.
 
     Where the search with hints found a place that would be reported, any other that explains more is a better one: one
-    that the search without them met, or one beside it, for in a lattice that search may lead nowhere.
-    Where it did not, only a place that would be reported itself is. A better place that agrees with the hints is the
-    answer: the places found without them.
+    beside it, or one that the search without them met, or, where that led nowhere, as in a lattice, a search at its own
+    heading and scale. Where it did not, only a place that would be reported itself is. A better place that agrees with
+    the hints is the answer: the places found without them.
     """
     free, needed = without_hints(options), options.min_log10_odds
     leading = max(hinted, key=lambda result: result.places[0].score if result.places else -math.inf)
     if free is None or leading.counts["searched"] == 0 or options.method == "pair":
         return list(hinted)
-    is_reported = bool(leading.places) and leading.places[0].score >= needed
-    if not is_reported:
+    best = next(iter(leading.places), None)
+    fewer, others = [free], list[Place]()
+    is_reported = best is not None and best.score >= needed
+    if best is not None and is_reported:
+        fewer.append(_alike(best, free))
+        others += [place for place in places_beside(best, free.match) if broken_hints(place, options)]
+    else:
         brief = replace(free.search, work_limit_s=min(_BRIEFLY_S, free.search.work_limit_s))
-        free = replace(free, effort="quick", search=brief)
+        fewer = [replace(free, effort="quick", search=brief)]
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
-    results = search_references(query, here, free, time_limit_s)
-    others = [place for result in results for place in (result.likeliest if is_reported else result.places[:1])]
-    if is_reported:
-        others += [place for place in places_beside(leading.places[0], free.match) if broken_hints(place, options)]
-    else:
-        others = [place for place in others if place.score >= needed]
-    better = _better(leading.places[0] if leading.places else None, others)
-    if better is not None and not broken_hints(better, options):  # hints led past it
-        return results
-    spent_s = sum(result.seconds.total for result in results)
+    spent_s = 0.0
+    for known in fewer:
+        results = search_references(query, here, known, max(time_limit_s - spent_s, 0.0))
+        spent_s += sum(result.seconds.total for result in results)
+        standing = [place for result in results for place in result.places[:1] if place.score >= needed]
+        others += [place for result in results for place in result.likeliest] if is_reported else standing
+        better = _better(best, others)
+        if better is not None and not broken_hints(better, options):  # hints led past it
+            return results
+        if better is not None or standing:
+            break
     return [replace(result, better=better).later(spent_s) if result is leading else result for result in hinted]
 
 
@@ -89,7 +99,7 @@ def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:
     ]
     likelihood, best = max(weighed, key=lambda pair: pair[0], default=(-math.inf, None))
     own = hinted.agreement.log10_likelihood
-    if best is None or likelihood < own + _MORE:
+    if best is None or likelihood <= own:
         return None
     return best.but(score=likelihood - own, by=Weight(likelihood, hinted.but(by=None).statement_px))
 

@@ -86,6 +86,29 @@ def test_where_the_search_without_hints_finds_nothing_the_blocks_beside_may_stil
     assert answer(town, hinted(town), [best]).located
 
 
+@pytest.mark.parametrize("score", [9.0, 1.0])
+def test_where_the_search_without_hints_leads_nowhere_places_alike_are_searched(town, monkeypatch, score):
+    """Of the hinted place's own heading and scale; only where that one would be reported."""
+    query, index = town
+    (best, *_) = found(town, hinted(town))
+    searched = []
+
+    def search(_query, _parts, options, _limit_s):
+        searched.append(options.match.camera)
+        is_alike = options.match.camera.heading is not None
+        return [Searched(index, likeliest=(best,)) if is_alike else Searched(index)]
+
+    monkeypatch.setattr(veto, "search_references", search)
+    monkeypatch.setattr(veto, "places_beside", lambda *_: [])
+    wrong = Place(query.scene, index, shifted(best.matrix, 900.0, 0.0)).but(refined=best.refined, score=score)
+    is_better = answer(town, hinted(town, 900.0), [wrong]).reason_code is Reason.FITS_ELSEWHERE
+    assert (is_better, len(searched)) == ((True, 2) if score == 9.0 else (False, 1))
+    assert searched[0] == CameraOptions()
+    for camera in searched[1:]:
+        assert camera.gsd_m[0] < best.gsd_m < camera.gsd_m[1]
+        assert camera.turned_off(*(best.corners[0] - best.corners[3])) < 0.0
+
+
 @pytest.mark.parametrize(
     ("score", "near_m", "where"),
     [
@@ -145,9 +168,8 @@ def test_another_place_lies_elsewhere_is_turned_or_is_of_another_size(town, turn
     assert veto._is_other(Place(query.scene, index, TRUTH), Place(query.scene, index, moved)) is is_other
 
 
-@pytest.mark.parametrize(("more", "is_better"), [(0.3, False), (0.7, True)])
-def test_a_place_that_explains_hardly_more_is_no_better_one(town, monkeypatch, more, is_better):
-    """Where streets repeat a hint is what tells equal places apart."""
+@pytest.mark.parametrize(("more", "is_better"), [(-0.1, False), (0.0, False), (0.1, True)])
+def test_whatever_explains_more_is_a_better_place(town, monkeypatch, more, is_better):
     query, index = town
     here = Place(query.scene, index, TRUTH)
     there = Place(query.scene, index, shifted(TRUTH, 300.0, 0.0))
