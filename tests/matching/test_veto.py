@@ -104,9 +104,9 @@ def test_where_the_search_without_hints_leads_nowhere_places_alike_are_searched(
     is_better = answer(town, hinted(town, 900.0), [wrong]).reason_code is Reason.FITS_ELSEWHERE
     assert (is_better, len(searched)) == ((True, 2) if score == 9.0 else (False, 1))
     assert searched[0] == CameraOptions()
-    for camera in searched[1:]:
-        assert camera.gsd_m[0] < best.gsd_m < camera.gsd_m[1]
-        assert camera.turned_off(*(best.corners[0] - best.corners[3])) < 0.0
+    for alike in searched[1:]:
+        assert alike.gsd_m[0] < best.gsd_m < alike.gsd_m[1]
+        assert alike.turned_off(*(best.corners[0] - best.corners[3])) < 0.0
 
 
 @pytest.mark.parametrize(
