@@ -70,6 +70,8 @@ def fence_of(command: str, given: Mapping[str, Any], allowed: Iterable[str]) -> 
     if out := given.get("out_dir"):
         (write if command in _GOES_ON else results).append(os.fspath(out))
         read += _earlier(out, bool(given.get("skip_existing")))
+    elif given.get("as_map"):
+        results.append(os.curdir)
     if out := given.get("out"):
         read.append(out)
         (write if given.get("shards") is not None else results).append(_target(out, given))

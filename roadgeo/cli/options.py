@@ -268,7 +268,9 @@ def _click_option(home: type, of: Field[Any], said: Mapping[str, Any]) -> click.
         kind = {"type": click.Path()}
     else:
         kind = {} if "type" in more else _kind_of(home, of, limits, above)
-    return _Option([*names.split(), of.name], **{"default": of.default, "metavar": form, **kind, **more})
+    if not more.get("required"):  # None would count as given
+        kind["default"] = of.default
+    return _Option([*names.split(), of.name], **{"metavar": form, **kind, **more})
 
 
 def _kind_of(home: type, of: Field[Any], limits: tuple[Any, Any] | None, above: bool | None) -> dict[str, Any]:

@@ -117,6 +117,11 @@ def test_evaluate_reads_query_sets(town, tmp_path, capsys):
     assert "100 (34-100)" in printed
 
 
+def test_simulate_asks_where_to_write(town, capsys):
+    assert run("simulate", town, "-n", 1) == 2
+    assert "'--out-dir'" in capsys.readouterr().err
+
+
 def test_a_map_is_written_styled(town, tmp_path, capsys, monkeypatch):
     options = ["--map", "-n", 6, "--check", 2, "--noise", "clean", "--height", 400, "--size", 400]
     assert run("evaluate", town, *options, "-o", tmp_path) == 0

@@ -216,6 +216,13 @@ def test_a_reference_in_another_folder_gets_its_index_there(porto: Path, tmp_pat
     assert not list(tmp_path.rglob(".roadgeo*"))
 
 
+def test_a_map_of_where_it_works_is_written_here(porto: Path, tmp_path: Path) -> None:
+    view = ("--height", "400", "--size", "400", "--noise", "clean", "-n", "4")
+    done = roadgeo(tmp_path, "evaluate", str(porto), "--map", *view)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "porto_localizability.tif").is_file()
+
+
 def test_images_are_corrected_where_they_lie(porto: Path, tmp_path: Path) -> None:
     shutil.copy(DRONE, tmp_path)
     assert main(["locate", "drone.png", "-r", str(porto), "-q"]) == 0
