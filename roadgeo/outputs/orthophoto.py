@@ -52,6 +52,7 @@ _BLOCK = 512  # side of the blocks that are drawn one after another
 _BORDER = cv2.BORDER_REPLICATE
 _BANDS = 4  # that OpenCV looks up at a time
 _SEEN = 255  # in OpenCV's masks
+_LABELS = 16  # a picture whose values all lie below holds labels
 _REACH = 8  # pixels around a block's source that interpolation may look at
 _TILED_BYTES = 1 << 28  # larger pictures that can only be read from the top down are first copied into tiles
 _MAX_SOURCE = 8192  # sides of a block's source beyond which it is read coarser
@@ -69,7 +70,7 @@ _DRAWABLE = tuple(np.dtype(name) for name in ("uint8", "uint16", "int16", "float
 def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
     """Read a picture to look at: (h, w, 4) uint8, red, green, blue, alpha, neither side longer than `side` pixels.
 
-    Values deeper than 8 bit are stretched between the darkest and the brightest hundredth.
+    Values deeper than 8 bit, and labels, are stretched between the darkest and the brightest hundredth.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
         values = picture.read(bands, out_shape=(len(bands), height, width), resampling=averaged)
         valid = picture.dataset_mask(out_shape=(height, width))
     colors = np.moveaxis(values, 0, 2) if palette is None else palette[values[0]]
-    if colors.dtype != np.uint8:
+    if colors.dtype != np.uint8 or (palette is None and colors.max(initial=0) < _LABELS):
         low, high = np.nanpercentile(colors[valid > 0], (1, 99)) if valid.any() else (0.0, 1.0)
         colors = np.clip((np.nan_to_num(colors.astype(float)) - low) * (255.0 / max(high - low, 1e-9)), 0, 255)
     preview = np.empty((height, width, 4), np.uint8)

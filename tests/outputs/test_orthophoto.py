@@ -209,6 +209,14 @@ def test_a_preview_is_small_and_shows_what_is_known(tmp_path: Path, dtype: str, 
     assert np.array_equal(row[:, 0], row[:, 2])
 
 
+@pytest.mark.parametrize(("ground", "road"), [(0, 1), (1, 2)])
+def test_a_preview_of_labels_shows_roads_on_ground(tmp_path: Path, ground: int, road: int) -> None:
+    labels = np.full((1, 40, 40), ground, np.uint8)
+    labels[:, 20:24] = road
+    preview = read_preview(write_raster(tmp_path / "a.tif", labels), 1000)
+    assert preview[[5, 22], 5, 0].tolist() == [0, 255]
+
+
 def test_a_preview_of_a_palette_shows_its_colours(tmp_path: Path) -> None:
     labels = np.repeat(np.array([[0, 1]], np.uint8), 40, axis=0).repeat(20, axis=1)[None]
     colors = {0: (10, 20, 30, 255), 1: (200, 100, 50, 255)}
