@@ -17,7 +17,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.flights.mosaic import draw_mosaic, road_px
 from roadgeo.flights.motion import TracedMask, between_images, overlay
-from roadgeo.flights.tracker import AROUND, FlightFrame, Tracked, Tracker, TrackOptions
+from roadgeo.flights.tracker import AROUND, FlightFrame, Tracked, Tracker, TrackOptions, why_refused
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
@@ -118,7 +118,8 @@ class _Net:
             mosaic.mask, references, replace(options, min_log10_odds=round(options.min_log10_odds + paid, 1))
         )
         if not location.located:
-            return [], f"{len(frames)} frames together: {location.reason}" if len(frames) > 1 else location.reason
+            why = why_refused(location)
+            return [], f"{len(frames)} frames together: {why}" if len(frames) > 1 else why
         placed = [tracked for tracked in tracker.place(location, mosaic, frames) if tracked.status == "located"]
         return placed, "a place was found, but the frames by themselves do not agree"
 

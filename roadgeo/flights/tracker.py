@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo._text import counted
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import Candidates, MosaicQuery
 from roadgeo.flights.mosaic import Mosaic, road_px, stitch
@@ -33,7 +34,10 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
 
-__all__ = ["AROUND", "Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest"]
+__all__ = [
+    "AROUND", "Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest",
+    "why_refused",
+]  # fmt: skip
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
@@ -308,7 +312,7 @@ class Tracker:
         n_shown = 0 if query is None else len(query.scene.intersections)
         least = max(_FEWEST, self._searched_at + _MORE)
         if query is None or (n_shown < least and not self._candidates):
-            why = f"waits: {len(masks)} frames show {n_shown} intersections, looked for again with {least}"
+            why = f"waits: in {counted(len(masks), 'frame')} {n_shown} intersections, looked for again with {least}"
             return [Tracked(frame, "lost", why, frame.number)]
         self._waited += 1
         searched = n_shown >= least or self._waited >= _MORE_FRAMES
@@ -317,7 +321,7 @@ class Tracker:
         frames = MosaicQuery(query, mosaic, [member.frame.number for member in self._window], searched)
         location = self._candidates.decide(frames, self.search_options(mosaic, masks))
         if not location.located:
-            return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
+            return [Tracked(frame, "lost", f"{counted(len(masks), 'frame')}: {why_refused(location)}", frame.number)]
         return self._settle(location, mosaic) or [
             Tracked(frame, "lost", "a place was found, but the frames by themselves do not agree", frame.number)
         ]
@@ -408,6 +412,11 @@ def follow(
     tracker = Tracker(references, options)
     for frame in frames:
         yield frame, tracker.feed(frame)
+
+
+def why_refused(location: Location) -> str:
+    """Return why a mosaic was not located, without the hints that decide for images alone: flights lack some."""
+    return location.reason.partition("; ")[0]
 
 
 def _trace(mask: RoadMask) -> Scene | None:

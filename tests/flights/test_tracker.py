@@ -101,6 +101,13 @@ def blocks():
     return flown, Reference(index, network)
 
 
+def test_frames_of_another_town_are_told_so_without_hints_that_flights_lack(flight, blocks):
+    lost = [one.reason for one in latest(follow(flight[1], [blocks[1]]))]
+    assert lost[0] == "waits: in 1 frame 4 intersections, looked for again with 6"
+    assert "frames: no place on this map stands out" in lost[-1]
+    assert "--heading" not in "".join(lost)
+
+
 def test_frames_are_followed_where_a_block_beside_would_do_as_well(blocks):
     """What is known is not a block off: that streets are alike tells nothing against a frame that was followed."""
     flown, reference = blocks
