@@ -1,4 +1,4 @@
-"""Where a query mask enters: any raster that GDAL reads becomes a `RoadMask`."""
+"""Where a query mask enters: any raster that is read here becomes a `RoadMask`."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     items = "".join(_item(entry, shared[entry.path.name] > 1) for entry in shown)
     listed = f'<ol class="list">{items}</ol>{note if left_out else ""}'
     credit = name_owners(index for index, _ in maps)
-    return render_page(counted(len(entries), "image"), states, views[0], [section("Masks", listed), *others], credit)
+    return render_page(counted(len(entries), "image"), states, views[0], [section("Images", listed), *others], credit)
 
 
 def _has_place(entry: Entry) -> bool:
