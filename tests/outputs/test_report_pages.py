@@ -26,6 +26,7 @@ from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Location, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
+from roadgeo.outputs.drawing.views import whole_map
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.report import Entry, render_batch, write_batch
@@ -157,6 +158,20 @@ def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) 
     assert "href" not in text
     few = replace(location, content=replace(location.content, xy=np.zeros((4, 2))))
     assert "4 intersections are seen in the mask: few" in Reader(render_report(few, mask, porto.index)).text
+
+
+def test_a_footprint_over_the_edge_of_the_map_is_shown_whole(
+    porto: Reference, drone: RoadMask, found: Location
+) -> None:
+    assert found.place is not None
+    beyond = replace(found, places=(moved(found.place, 1500.0, 0.0),))
+    page = render_report(beyond, drone, porto.index)
+    (box,) = re.findall(r'class="overview" viewBox="([^"]+)"', page)
+    left, _, width, _ = map(float, box.split())
+    _, window = whole_map(porto.index, 2000, 100)
+    assert beyond.place is not None
+    east = window.place(beyond.place.footprint)[:, 0].max()
+    assert window.width < east <= left + width + 1.0
 
 
 def test_half_a_place_is_no_choice_of_two(porto: Reference, drone: RoadMask, found: Location) -> None:

@@ -204,9 +204,13 @@ def _draw_overview(subject: Subject) -> str:
     if index.name != location.reference:  # several were searched
         return f"<p>Searched: {in_html(location.reference)}.</p>"
     picture, window = whole_map(index, subject.views.overview_bytes, 2 * _OVERVIEW_PX)
-    layers = [picture]
+    layers, size = [picture], np.array((window.width, window.height))
+    low, high = np.zeros(2), size
     if subject.has_place:
-        layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
+        ring = window.place(subject.place.footprint)
+        layers.append(Layer(location.status, "", [Ring(ring)]))
+        within = np.clip(ring, -size, 2 * size)  # it may lie over the edge, or reach to the horizon
+        low, high = np.minimum(low, within.min(axis=0)), np.maximum(high, within.max(axis=0))
     rings = [place.footprint_lonlat for place in location.alternatives if place.reference in ("", index.name)]
     grounds = [transform("EPSG:4326", index.plane.crs, ring) for ring in rings]
     others: list[Cross | Ring] = [Ring(window.place(ground)) for ground in grounds if np.isfinite(ground).all()]
@@ -216,10 +220,10 @@ def _draw_overview(subject: Subject) -> str:
     if others:
         layers.append(Layer("runner-up", "", others))
     text = f"All of the map {index.name}" + (", with the footprint" if subject.has_place else "")
-    box = " ".join(f"{value:.0f}" for value in window.box)
+    box = " ".join(f"{value:.0f}" for value in (*low, *(high - low)))
     return (
         f'<svg class="overview" viewBox="{box}" role="img" aria-label="{in_html(text)}" '
-        f'style="--u:{window.width / _OVERVIEW_PX:.4g}">{"".join(map(draw_layer, layers))}</svg>'
+        f'style="--u:{(high - low)[0] / _OVERVIEW_PX:.4g}">{"".join(map(draw_layer, layers))}</svg>'
         f'<p class="faint">{in_html(index.name)}: {len(index):,} intersections, '
         f"{window.width / 1000:.0f} × {window.height / 1000:.0f} km</p>"
     )
