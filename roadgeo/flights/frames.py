@@ -374,7 +374,7 @@ def _segment(image: _FrameFile, options: FrameOptions, last: _Last) -> tuple[Roa
 
     reading = options.reading
     network = load_model(reading.segmenter, reading.class_name, reading.threads)
-    with open_photograph(image.path, reading.bands) as opened:
+    with open_photograph(image.path, reading.bands, image.name) as opened:
         photograph = opened.stretched(*image.stretch)
         if last.scale is None:
             gsd_m = None if options.gsd_m is None else math.sqrt(math.prod(options.gsd_m))

@@ -87,6 +87,19 @@ def test_frames_are_upright(model: FrameOptions, photographs: list[str], tmp_pat
     assert third.mask.shape == (300, 400)
 
 
+def test_messages_about_a_frame_of_a_video_name_the_frame(
+    model: FrameOptions, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not the file in a temporary folder that it is read from."""
+    picture = cv2.imread(str(PHOTO))[200:500, 300:700]
+    picture[:, 300:] = 255
+    video = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (400, 300))
+    video.write(picture)
+    video.release()
+    list(read_frames([str(tmp_path / "a.avi")], model))
+    assert "a_000000: plain margins are not observed" in caplog.messages[0]
+
+
 def test_photographs_are_refused_where_masks_are_meant(photographs: list[str]) -> None:
     with pytest.raises(PhotographError):
         list(read_frames(photographs, FrameOptions(ReadOptions(segment="never"))))

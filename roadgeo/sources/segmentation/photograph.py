@@ -81,20 +81,24 @@ class Photograph:
 
 
 @contextmanager
-def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | None = None) -> Iterator[Photograph]:
+def open_photograph(
+    path: str | os.PathLike[str], bands: tuple[int, int, int] | None = None, name: str | None = None
+) -> Iterator[Photograph]:
     """Open a photograph.
 
     Parameters
     ----------
     bands : (3,) tuple of int, optional
         Numbers from 1 of the red, green and blue band. Default: by their names, or else the first three.
+    name : str, optional
+        Its name in messages. Default: the path.
 
     Raises
     ------
     MaskError
         It is missing, no raster, too small or too large, or has no bands of colour or grey.
     """
-    name = os.fspath(path)
+    name = os.fspath(path) if name is None else name
     with open_raster(path) as dataset:
         if min(dataset.shape) < MIN_SIDE or max(dataset.shape) > MAX_SIDE:
             raise MaskError(
