@@ -98,7 +98,7 @@ FROM_CODE = [
     ("docs/scale.md", r"map of more than ([\d,]+) intersections a place also", triples._USUAL_SIZE),
     ("docs/commands/locate.md", r"`--max-tilt 20` \| the default is (\d+)", CAMERA.max_tilt_deg),
     ("docs/commands/locate.md", r"some (\w+) seconds of a usual machine at most", SearchOptions().work_limit_s),
-    ("docs/commands/locate.md", r"GDAL reads, (\d+) to ([\d,]+) pixels", (masks.MIN_SIDE, masks.MAX_SIDE)),
+    ("docs/commands/locate.md", r"probabilities, (\d+) to ([\d,]+) pixels", (masks.MIN_SIDE, masks.MAX_SIDE)),
     (
         "docs/commands/locate.md",
         r"([\d.]+) alone stands for ([\d.]+) to ([\d.]+)\.",
