@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import log_of
-from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
+from roadgeo.errors import MaskError, ModelError, NotLocatedError, OutputError, RoadgeoError
 from roadgeo.running.pool import Asker, Lost
 from roadgeo.running.processes import Processes, tell
 from roadgeo.storage.fence import Fence
@@ -34,7 +34,12 @@ _GRACE_S = 15.0
 _PATIENT_S = 90.0
 
 #: The status of an error about an image; of others it is 500. Photographs need a network that may not be there.
-_STATUSES: dict[type[RoadgeoError], int] = {MaskError: 422, OutputError: 422, ModelError: 415}
+_STATUSES: dict[type[RoadgeoError], int] = {
+    MaskError: 422,
+    NotLocatedError: 422,
+    OutputError: 422,
+    ModelError: 415,
+}
 #: The status of a lost task, and the sentence about it.
 _LOST = {
     "died": (500, "it broke two processes, one after another; send another image"),
@@ -203,6 +208,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     import numpy as np
 
     from roadgeo.matching.hints import apply_hints, asked_of_camera
+    from roadgeo.reference.opening import swapped_near
     from roadgeo.running.choosing import place_by_points, take_place
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.queries import locate_query
@@ -226,6 +232,11 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     hints.update(read_stated(asked_of_camera(hints), request.path))
     taken, points = hints.pop("take", None), hints.pop("points", None)
     options = apply_hints(LocateOptions(), hints)
+    near = options.near
+    if near is not None and (meant := swapped_near(near, references)) is not None:
+        given, other = (",".join(f"{number:.9g}" for number in place) for place in (near, meant))
+        detail = f"near={given} lies on none of the maps; longitude comes first: did you mean near={other}?"
+        return Reply(400, {"detail": detail})
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     kept = Path(request.path).parent.with_name(OWN) / SEEN

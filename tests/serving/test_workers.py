@@ -29,6 +29,7 @@ from roadgeo.cli import main
 from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Content, Location
 from roadgeo.reference.opening import open_reference
 from roadgeo.reference.reference import Reference
@@ -88,6 +89,24 @@ def test_what_a_process_answers(place, tmp_path):
     assert cut.status == 422
     assert "the image" in cut.document["detail"]
     assert str(tmp_path) not in cut.document["detail"]
+
+
+def test_a_place_that_is_not_listed_is_no_fault(place):
+    folder, _ = place
+    asked = ImageRequest(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0), "take": 9}, 10.0, 64_000_000)
+    answer = _reply(asked, [open_reference(folder / "town.gpkg")])
+    assert answer.status == 422
+    assert "there is no place 9" in answer.document["detail"]
+
+
+def test_a_circle_on_no_map_is_refused_where_longitude_and_latitude_are_exchanged(place):
+    folder, _ = place
+    town = open_reference(folder / "town.gpkg")
+    lon, lat = to_lonlat(town.index.plane.crs, town.index.plane.to_crs(town.index.xy[:1]))[0].tolist()
+    asked = ImageRequest(str(folder / "mask.png"), {"near": (lat, lon, 900.0)}, 10.0, 64_000_000)
+    answer = _reply(asked, [town])
+    assert answer.status == 400
+    assert f"did you mean near={lon:.9g},{lat:.9g},900" in answer.document["detail"]
 
 
 def test_a_fault_is_answered_and_not_where_files_lie(place, monkeypatch):
