@@ -21,6 +21,7 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, extent
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.veto import without_hints
 from roadgeo.reference.opening import AnyReference
 from roadgeo.running.passes import Locate
 
@@ -103,6 +104,8 @@ Judge = Callable[[Variant, tuple[int, int]], Location]
 def undoing(how: Locate, aspect: float | None, mirror: bool, judge: Judge | None = None) -> Locate:
     """Return what locates a mask as `how` does: without margins, with square pixels, and mirrored back.
 
+    Margins stay where hints are given: these are of the middle of the whole frame.
+
     Parameters
     ----------
     how : callable
@@ -117,9 +120,11 @@ def undoing(how: Locate, aspect: float | None, mirror: bool, judge: Judge | None
         def place(variant: Variant) -> Location | Explanation:
             return how(variant.mask, references, options) if judge is None else judge(variant, mask.shape)
 
-        variant = undone(trimmed(mask))
+        is_hinted = judge is None and without_hints(options) is not None  # of the middle of the whole frame
+        part = Variant(mask, np.eye(3)) if is_hinted else trimmed(mask)
+        variant = undone(part)
         answer = place(variant)
-        if trimmed(mask).mask is not mask and any(one.lens_k1 for one in _location_of(answer).places):
+        if part.mask is not mask and any(one.lens_k1 for one in _location_of(answer).places):
             variant = undone(Variant(mask, np.eye(3)))  # a lens bends around the middle of the whole frame
             answer = place(variant)
         if variant.mask is mask:

@@ -8,6 +8,8 @@ from worlds.demo import DRONE
 
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import metres_apart
+from roadgeo.matching.hints import apply_hints
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.opening import open_reference
 from roadgeo.running.variants import Variant, in_pixels_of, mirrored, resampled, undoing
@@ -75,6 +77,37 @@ def test_margins_that_were_not_observed_cost_nothing(located, porto, margins):
     assert np.allclose(Homography(found.homography)(corners), located.footprint, atol=1e-3)
     here = found.place.in_pixels(located.size, shift(left, top))
     assert np.allclose(here.corner_covariance_m2, located.corner_covariance_m2, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["near", "within"])
+def test_hints_are_of_the_middle_of_the_whole_frame_margins_included(porto, name):
+    mask, reference = read_mask(DRONE), open_reference(porto)
+    seen = np.ones(mask.shape, np.bool_)
+    seen[:, : mask.shape[1] * 2 // 5] = False
+    torn = RoadMask(mask.roads & seen, seen, "torn")
+    place = locate(mask, [reference]).place
+    lon, lat = place.center[2:]
+    hints = {"near": (lon, lat, 50.0), "within": (lon - 5e-4, lat - 5e-4, lon + 5e-4, lat + 5e-4)}
+    found = undoing(locate, None, False)(torn, [reference], apply_hints(LocateOptions(), {name: hints[name]}))
+    assert found.located, found.reason
+    assert metres_apart(np.array(found.place.center[2:]), np.array([lon, lat])) < 2.0
+
+
+@pytest.mark.parametrize("hints", [{"gsd_m": (0.9, 1.1)}, {"heading_deg": (90.0, 10.0)}])
+def test_scale_and_heading_are_of_that_middle_too(located, hints):
+    """A tilted camera sees other ground at another scale."""
+    mask = read_mask(DRONE)
+    seen = np.zeros(mask.shape, np.bool_)
+    seen[:, :500] = True
+    looked_at: list[RoadMask] = []
+
+    def look(shown, *_):
+        looked_at.append(shown)
+        return located
+
+    for given in ({}, hints):
+        undoing(look, None, False)(replace(mask, observed=seen), [], apply_hints(LocateOptions(), given))
+    assert [shown.shape[1] for shown in looked_at] == [500, mask.shape[1]]
 
 
 def test_masks_on_another_grid():
