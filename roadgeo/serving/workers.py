@@ -208,8 +208,9 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     import numpy as np
 
     from roadgeo.matching.hints import apply_hints, asked_of_camera
-    from roadgeo.reference.opening import swapped_near
+    from roadgeo.reference.opening import digest_of, swapped_near
     from roadgeo.running.choosing import place_by_points, take_place
+    from roadgeo.running.locating import changed_options
     from roadgeo.running.options import ReadOptions
     from roadgeo.running.queries import locate_query
     from roadgeo.serving.view import OWN, SEEN, read_sighting, write_view
@@ -252,7 +253,12 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
         sighting = sighting.answering(take_place(sighting.location, taken, options))
     if points is not None:
         sighting = sighting.answering(place_by_points(sighting.location, np.array(points), references))
-    location = replace(sighting.location, query=request.name)
+    location = replace(
+        sighting.location,
+        query=request.name,
+        options=changed_options(options, LocateOptions()),
+        reference_digest=digest_of(references, sighting.location.reference),
+    )
     location = replace(location, reason=_without(request.path, _without(str(kept), location.reason)))
     lacks_view = False
     if request.keeps:

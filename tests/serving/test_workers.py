@@ -83,6 +83,8 @@ def test_what_a_process_answers(place, tmp_path):
     ]
     found, elsewhere, small, bomb, cut = map(Serving((str(folder / "town.gpkg"),), 1).prepare(), asked)
     assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
+    assert found.document["reference_digest"] == open_reference(folder / "town.gpkg").digest
+    assert found.document["options"]["match"] == {"camera": {"gsd_m": [0.5, 2.0]}}
     assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
     assert (small.status, small.document["detail"][:15]) == (413, "900 x 900 pixel")
     assert bomb.status == 413
