@@ -131,5 +131,4 @@ def _search(
     if len(references) > 1:
         say(f"searching {len(references)} maps together")
     searched = search_references(query, parts, options, left, explained, say=say)
-    spent_s = sum(one.seconds.total for one in searched)
-    return query, contest(query, searched, parts, options, max(left - spent_s, 0.0)), options
+    return query, contest(query, searched, parts, options, left), options

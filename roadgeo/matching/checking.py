@@ -176,7 +176,11 @@ def _why_unknown(location: Location, given: Place, options: CheckOptions) -> str
     """Return why the search located nothing."""
     best = location.places[0]
     if location.reason_code is Reason.FITS_ELSEWHERE:
-        return f"the roads fit better {away(metres_apart(np.array(best.center[2:]), given.lonlat))} away"
+        offset, apart_m = _displacement(given, best), metres_apart(np.array(best.center[2:]), given.lonlat)
+        ways = [f"{away(apart_m)} away"] * (apart_m > options.tolerance_m)
+        ways += [f"turned by {abs(offset.turn_deg):.0f} degrees"] * (abs(offset.turn_deg) > options.search.turn_deg)
+        ways += [f"{offset.scale:.2f} times as large"] * (abs(math.log(offset.scale)) > math.log(_SCALED))
+        return f"the roads fit better {' and '.join(ways)}"
     if location.status == "ambiguous":
         return location.reason
     return _stands_out_too_little(best.score, _MIN_SCORE_AS_GIVEN, options)

@@ -174,7 +174,7 @@ def read_place(value: Any) -> tuple[float, float, float]:
     swapped = _swapped((lat, lon), f",{radius:g}")
     on_earth = -180 <= lon <= 180 and -90 <= lat <= 90
     _expect(on_earth, value, form, f"longitude must lie within ±180, latitude within ±90{swapped}")
-    _expect(0 < radius < 2e7, value, form, "the radius must be above 0 metres")
+    _expect(0 < radius < 2e7, value, form, "the radius must be above 0 and below 20,000,000 metres")
     return lon, lat, radius
 
 
@@ -282,7 +282,7 @@ _TABLE = (
     Hint(
         "time_limit", "time_limit_s", "SECONDS", "Time limit, seconds",
         "Stop searching for an image then. The paper's matcher stops after 10 by itself.",
-        lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
+        lambda value: _read_number(value, 1e-3, 1e6, "seconds from 0.001 to 1,000,000"),
         _ABOVE_0, round(SearchOptions.time_limit_s), "The search",
     ),
 )  # fmt: skip

@@ -196,7 +196,7 @@ def _search(
     ended = any(search.stopped in ("accepted", "time") for search in estimators)
     if units > 1 and options.effort == "full" and not ended:
         left, scale = left - (time.perf_counter() - started), float(units)
-        rivals = _search_alone(together, options, ledger, left, say)
+        rivals = _search_alone(estimators, options, ledger, left, say)
     compared = iter(rivals.compare_all())
     return [
         result if result.estimator is None else _end(result, result.estimator, *next(compared), rivals.needed, scale)
@@ -205,7 +205,7 @@ def _search(
 
 
 def _search_alone(
-    estimators: Sequence[TripleEstimator],
+    together: Mapping[Search[Place], TripleEstimator],
     options: LocateOptions,
     ledger: Ledger,
     time_limit_s: float,
@@ -215,9 +215,9 @@ def _search_alone(
 
     Returns the comparison of their places. The more is searched in all, by the `ledger`, the more a place must lead.
     """
-    for estimator in estimators:
+    for estimator in together.values():
         estimator.leave_company()
-    searches = {Search(estimator): estimator for estimator in estimators}
+    searches = {Search(estimator, search.seconds): estimator for search, estimator in together.items()}
     rivals = Rivals(searches, ledger, options.min_log10_odds, time_limit_s)
     usual = replace(options.search, time_limit_s=time_limit_s)
     limits = {
@@ -225,7 +225,7 @@ def _search_alone(
         for search, estimator in searches.items()
     }
     search_each(limits, rivals.stands, rivals.promise, rivals.may_go_on, _name_maps(searches, say))
-    for estimator in estimators:
+    for estimator in together.values():
         estimator.sweeps.end()
     return rivals
 

@@ -91,17 +91,17 @@ class Search(Generic[Model]):
         Why it ended: "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
         ended the search.
     seconds : float
-        Time spent on this part.
+        Time spent on this part, in searches before this one, too.
     """
 
-    def __init__(self, estimator: Estimator[Model]) -> None:
+    def __init__(self, estimator: Estimator[Model], seconds: float = 0.0) -> None:
         """Begin, without doing anything yet."""
         self.estimator = estimator
         self.score, self.best = float("-inf"), None  # type: float, Model | None
         self.stage = 0
         self.ended = False
         self.stopped = ""
-        self.seconds = 0.0
+        self.seconds = seconds
         self._charged_s = estimator.work
         self._stages = estimator.stages()
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)

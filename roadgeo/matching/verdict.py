@@ -9,7 +9,6 @@ from time import perf_counter
 
 import numpy as np
 
-from roadgeo._text import counted
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
@@ -285,8 +284,9 @@ def _why_nothing(
         return Reason.TIME_LIMIT if nearest.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, nearest.said
     within = searched_within(options)
     if nearest.counts["searched"] == 0 and (options.near is not None or options.match.within is not None):
-        given = "around the place given by near" if options.near is not None else "in the area given by within"
-        return Reason.FEW_NEAR, f"the map has {counted(nearest.counts['searched'], 'intersection')} {given}{within}"
+        given = ["around the place given by near"] * (options.near is not None)
+        given += ["in the area given by within"] * (options.match.within is not None)
+        return Reason.FEW_NEAR, f"no map has an intersection {' and '.join(given)}{within}"
     score = listed[0].score if listed else -math.inf
     best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if nearest.stopped == "work":

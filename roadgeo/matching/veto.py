@@ -57,7 +57,13 @@ def contest(
     Where the search with hints found a place that would be reported, any other that explains more is a better one: one
     beside it, or one that the search without them met, or, where that led nowhere, as in a lattice, a search at its own
     heading and scale. Where it did not, only a place that would be reported itself is. A better place that agrees with
-    the hints is the answer: the places found without them.
+    the hints is the answer: the places found without them. Where no time is left to search without hints, the place is
+    not reported.
+
+    Parameters
+    ----------
+    time_limit_s : float
+        For both, what the search with hints took included.
     """
     free, needed = without_hints(options), options.min_log10_odds
     leading = max(hinted, key=lambda result: result.places[0].score if result.places else -math.inf)
@@ -74,7 +80,8 @@ def contest(
         fewer = [replace(free, effort="quick", search=brief)]
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
-    spent_s = 0.0
+    time_limit_s -= sum(result.seconds.total for result in hinted)
+    spent_s, cut = 0.0, False
     for known in fewer:
         results = search_references(query, here, known, max(time_limit_s - spent_s, 0.0))
         spent_s += sum(result.seconds.total for result in results)
@@ -83,9 +90,20 @@ def contest(
         better = _better(best, others)
         if better is not None and not broken_hints(better, options):  # hints led past it
             return results
-        if better is not None or standing:
+        cut = any(result.stopped == "time" for result in results)
+        if better is not None or standing or cut:
             break
-    return [replace(result, better=better).later(spent_s) if result is leading else result for result in hinted]
+    is_unproved = better is None and is_reported and cut
+    contested = _unproved(leading) if is_unproved else replace(leading, better=better)
+    return [contested.later(spent_s) if result is leading else result for result in hinted]
+
+
+def _unproved(found: Searched) -> Searched:
+    """Return a result whose place is not reported, for there was no time to search without hints."""
+    said = "time limit reached before the roads were looked for without the hints: they may fit better elsewhere"
+    return replace(
+        found, places=tuple(place.but(score=min(place.score, 0.0)) for place in found.places), stopped="time", said=said
+    )
 
 
 def _better(hinted: Place | None, others: Sequence[Place]) -> Place | None:

@@ -189,7 +189,7 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
     assert capfd.readouterr().out == ""
     for limits, reported in [
         (["--near=-8.60,41.15,500"], "the roads fit better 2.8 km away, outside the circle given: leave --near out"),
-        (["--within", "Italy"], "the map has 0 intersections in the area given by within; searched within longitudes"),
+        (["--within", "Italy"], "no map has an intersection in the area given by within; searched within longitudes"),
         (
             ["--near=2.35,48.85,2000", "--gsd", "0.8:1.2"],
             "searched within 2 km of 2.35,48.85, at 0.8 to 1.2 m per pixel",

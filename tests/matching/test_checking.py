@@ -1,5 +1,6 @@
 """Given places on made-up towns: right, off, or not to be judged."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -71,10 +72,14 @@ def test_a_wrong_one_is_off_by_what_it_was_moved_by(town, sights, shift) -> None
 
 def test_what_lies_beyond_the_reach_or_on_another_map_is_not_judged(town, sights) -> None:
     truth, query = sights[0]
-    for shift in (Shift(700, 500, 0, 1, 0), Shift(0, 0, 90, 1, 0)):
+    for shift, how in (
+        (Shift(700, 500, 0, 1, 0), r"\d+ m away"),
+        (Shift(0, 0, 90, 1, 0), "turned by 90 degrees"),
+        (Shift(0, 0, 0, 1.4, 0), "0.71 times as large"),
+    ):
         found = check_place(lied(truth, query, shift), query, town[1])
         assert found.verdict == "unknown"
-        assert "fit better" in found.reason
+        assert re.fullmatch(f"the roads fit better {how}", found.reason)
     away = check_place(lied(truth, query, Shift(50_000, 0, 0, 1, 0)), query, town[1])
     assert (away.verdict, away.displacement) == ("unknown", None)
     assert "not on this map" in away.reason

@@ -145,7 +145,7 @@ def test_a_place_off_the_map_is_told(town, mask):
     explanation = explain(mask, town, LocateOptions(near=(0.0, 80.0, 500.0)))
     search = check(explanation)
     assert explanation.location.reason == (
-        "the map has 0 intersections around the place given by near; searched within 500 m of 0,80"
+        "no map has an intersection around the place given by near; searched within 500 m of 0,80"
     )
     assert search["missing"] == [explanation.location.reason]
 

@@ -109,6 +109,24 @@ def test_where_the_search_without_hints_leads_nowhere_places_alike_are_searched(
         assert alike.turned_off(*(best.corners[0] - best.corners[3])) < 0.0
 
 
+def test_where_time_ends_before_the_search_without_hints_the_place_is_not_reported(town, monkeypatch):
+    """What took the search with hints is part of the time."""
+    query, index = town
+    limits = []
+
+    def search(_query, _parts, _options, limit_s):
+        limits.append(limit_s)
+        return [Searched(index, stopped="time")]
+
+    options = hinted(town)
+    (best, *_) = found(town, options)
+    monkeypatch.setattr(veto, "search_references", search)
+    searched = [Searched(index, (best,), counts=Counter(searched=len(index)), seconds=Seconds(match=59.0))]
+    location = decide(query, veto.contest(query, searched, [Whole(index)], options, 60.0), options)
+    assert (location.status, location.reason_code, limits) == ("not_located", Reason.TIME_LIMIT, [1.0])
+    assert "without the hints" in location.reason
+
+
 @pytest.mark.parametrize(
     ("score", "near_m", "where"),
     [
