@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice, zip_longest
@@ -45,7 +45,7 @@ from roadgeo.matching.triples import (
     propose,
 )
 
-__all__ = ["HARDLY", "Ledger", "MatchOptions", "TripleEstimator"]
+__all__ = ["EQUAL", "HARDLY", "Ledger", "MatchOptions", "TripleEstimator"]
 
 #: Stop refining a place below this log10 likelihood, or, after the first two refinements, below this part of
 #: the best place's: 276 of 277 right places led every other place by a fifth after the first.
@@ -58,7 +58,7 @@ HARDLY = 0.5
 _LEADING = 2.0
 #: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
 #: and the part of their neighbours there that an equal place has at least.
-_OWN_TUPLES, _EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
+_OWN_TUPLES, EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
 #: by roads, and fitting a hypothesis to the map once, plus the time for each road point.
@@ -268,32 +268,47 @@ class TripleEstimator:
                 distinct.append(place)
                 yield place
 
-    def look_for_equals(self, place: Place, deadline: float = math.inf) -> bool:
-        """Verify where else on the map a place's own tuples fit, at any turn and scale; once for each place.
+    def look_for_equals(self, place: Place, deadline: float = math.inf, beside: Sequence[TripleEstimator] = ()) -> bool:
+        """Verify where else a place's own tuples fit, on its map and on others beside, at any turn and scale; once.
 
         They are refined to the end: an equal place that grew from few intersections explains little at first. Returns
         whether all were looked for before the deadline, by `time.perf_counter`.
         """
         if any(other.same(place) for other in self._equals_of):
             return True
-        camera, there = self.options.camera, place.matches[0]
-        scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
-        args = self.scene, [self.index], scale, camera.min_shape_ratio, _OWN_TUPLES
-        anchors = propose(*args, self.sweeps.ahead, np.flatnonzero(there >= 0))
-        for (proposals,) in islice(anchors, N_RAREST):
+        there, placed = place.matches[0], dict[int, float]()
+        for (proposals,) in self._own_tuples([self.index], np.flatnonzero(there >= 0)):
             is_own = proposals.reference == there[proposals.anchor]
-            placed = _EQUAL * int(proposals.placed[is_own].max(initial=0))
-            elsewhere = self.allow(proposals) & ~is_own & (proposals.placed >= placed)
-            kept = self.screen(proposals, elsewhere, MAX_SCREENED)
-            for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
-                if time.perf_counter() > deadline:
+            placed[proposals.anchor] = least = EQUAL * int(proposals.placed[is_own].max(initial=0))
+            if not self._verify_equals(place, proposals, ~is_own & (proposals.placed >= least), deadline):
+                return False
+        anchors = np.array([anchor for anchor, least in placed.items() if least > 0.0], int)
+        for found in self._own_tuples([one.index for one in beside], anchors) if beside else ():
+            for one, proposals in zip(beside, found, strict=True):
+                alike = proposals.placed >= placed[proposals.anchor]
+                if not one._verify_equals(place, proposals, alike, deadline):
                     return False
-                if other.same(place):
-                    continue
-                whole = self.refine_whole(self.settle(other)[0])
-                if whole.refined is not None and self.may_be(whole.matrix):
-                    self.verified.append(whole)
         self._equals_of.append(place)
+        return True
+
+    def _own_tuples(self, indexes: Sequence[ReferenceIndex], anchors: IntArray) -> Iterator[list[Proposals]]:
+        """Yield where tuples of intersections of the query fit, at any turn and scale, the rarest first."""
+        camera = self.options.camera
+        scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
+        args = self.scene, indexes, scale, camera.min_shape_ratio, _OWN_TUPLES
+        return islice(propose(*args, self.sweeps.ahead, anchors), N_RAREST)
+
+    def _verify_equals(self, place: Place, proposals: Proposals, alike: BoolArray, deadline: float) -> bool:
+        """Verify places other than this one; return whether all were before the deadline."""
+        kept = self.screen(proposals, self.allow(proposals) & alike, MAX_SCREENED)
+        for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
+            if time.perf_counter() > deadline:
+                return False
+            if other.same(place):
+                continue
+            whole = self.refine_whole(self.settle(other)[0])
+            if whole.refined is not None and self.may_be(whole.matrix):
+                self.verified.append(whole)
         return True
 
     def settle(self, place: Place) -> tuple[Place, float]:

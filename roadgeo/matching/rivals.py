@@ -26,7 +26,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import CameraFault, judge
-from roadgeo.matching.estimator import HARDLY, MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import EQUAL, HARDLY, MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.picture import Picture, by_picture
@@ -157,6 +157,8 @@ class Rivals:
         others = _likeliest(self.estimators[part])
         if best is None or self._are_near(best.but(by=None), others):
             return True
+        if any(other.explained > EQUAL * best.but(by=None).explained for other in others):
+            return True
         if best.scene.probability is None:
             return False
         pictured, *others = (by_picture(place, best.gsd_m) for place in [best, *others[:N_LIKELIEST]])
@@ -218,7 +220,9 @@ class Rivals:
         place = self._by_roads(part)
         if place is None or place.score < self.needed:
             return place
-        if not self.estimators[part].look_for_equals(place, self._deadline):
+        own = self.estimators[part]
+        beside = [estimator for estimator in self.estimators.values() if estimator is not own]
+        if not own.look_for_equals(place, self._deadline, beside):
             return place.but(score=min(place.score, 0.0))
         return self._by_roads(part)
 
