@@ -59,6 +59,8 @@ _LEADING = 2.0
 #: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
 #: and the part of their neighbours there that an equal place has at least.
 _OWN_TUPLES, EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
+#: Most of them that are looked up on maps beside: each of these is looked up, and an equal place has most of them.
+_BESIDE = 3
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
 #: by roads, and fitting a hypothesis to the map once, plus the time for each road point.
@@ -277,12 +279,15 @@ class TripleEstimator:
         if any(other.same(place) for other in self._equals_of):
             return True
         there, placed = place.matches[0], dict[int, float]()
-        for (proposals,) in self._own_tuples([self.index], np.flatnonzero(there >= 0)):
+        known = there >= 0
+        near = self.scene.neighbours[:, : _OWN_TUPLES.n_neighbours]
+        whole = known & ((known[near] & (near >= 0)).sum(axis=1) >= 2)  # a triple has two of its neighbours
+        for (proposals,) in self._own_tuples([self.index], np.flatnonzero(whole)):
             is_own = proposals.reference == there[proposals.anchor]
             placed[proposals.anchor] = least = EQUAL * int(proposals.placed[is_own].max(initial=0))
             if not self._verify_equals(place, proposals, ~is_own & (proposals.placed >= least), deadline):
                 return False
-        anchors = np.array([anchor for anchor, least in placed.items() if least > 0.0], int)
+        anchors = np.array([anchor for anchor, least in placed.items() if least > 0.0][:_BESIDE], int)
         for found in self._own_tuples([one.index for one in beside], anchors) if beside else ():
             for one, proposals in zip(beside, found, strict=True):
                 alike = proposals.placed >= placed[proposals.anchor]
