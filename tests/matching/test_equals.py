@@ -1,9 +1,10 @@
-"""Places that are equal, on one map: what a place's own tuples fit elsewhere, at any turn and scale, is its rival."""
+"""Equal places, on one map or several: what a place's own tuples fit elsewhere, at any turn and scale, is its rival."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import shapely
 from shapely import affinity
 from worlds.scenes import PLANE, camera, estimator_of, look, random_lines, scene_of
 
@@ -21,20 +22,23 @@ from roadgeo.roads.network import build_network
 TRUTH = camera((800, 800), (900, 900), 1.0, 0.0, 0.0, 25.0)
 
 
+def turned(scale, turn_deg, east_m):
+    """A turn about the origin, a scale and a shift, as shapely takes them."""
+    turn = np.radians(turn_deg)
+    a, b = scale * np.cos(turn), scale * np.sin(turn)
+    return [a, -b, b, a, east_m, 0.0]
+
+
 @pytest.fixture(scope="module")
 def twice():
     """A district, once more 1.2 times as large and turned by 37 degrees, and the middle of the frame there."""
     lines = random_lines(31, 1600.0)
-    again = [
-        affinity.translate(affinity.rotate(affinity.scale(line, 1.2, 1.2, origin=(0, 0)), 37.0, origin=(0, 0)), 4000.0)
-        for line in lines
-    ]
+    again = [affinity.affine_transform(line, turned(1.2, 37.0, 4000.0)) for line in lines]
     network = build_network(lines + again, PLANE, {"name": "twice"})
     graph = look(build_network(lines, PLANE, {"name": "once"}), TRUTH, (900, 900))
     scene = scene_of(graph, (900, 900))
-    x, y = Homography(TRUTH).everywhere(scene.center)
-    turn = np.radians(37.0)
-    there = 1.2 * np.array([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)]) + (4000.0, 0.0)
+    middle = shapely.Point(Homography(TRUTH).everywhere(scene.center))
+    there = shapely.get_coordinates(affinity.affine_transform(middle, turned(1.2, 37.0, 4000.0)))[0]
     return Query("frame", scene, graph, Seconds()), build_index(network), there
 
 
@@ -51,6 +55,20 @@ def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
     n_verified = estimator.n_verified
     estimator.look_for_equals(place)
     assert estimator.n_verified == n_verified
+
+
+def test_equal_places_on_other_maps_are_verified_too(twice):
+    query, _, there = twice
+    lines = random_lines(31, 1600.0)
+    again = [affinity.affine_transform(line, turned(1.2, 37.0, 4000.0)) for line in lines]
+    here, other, third = (
+        estimator_of(query.scene, build_index(build_network(some, PLANE, {"name": name})))
+        for name, some in (("here", lines), ("other", again), ("third", random_lines(32, 1600.0)))
+    )
+    place, _ = here.settle(Place(query.scene, here.index, TRUTH))
+    assert here.look_for_equals(place, beside=[third, other])
+    assert any(np.hypot(*(found.center - there)) < 5.0 for found in other.verified)
+    assert not any(found.log10_likelihood > 0.5 * place.log10_likelihood for found in third.verified)
 
 
 def test_an_equal_place_that_the_hints_exclude_is_no_rival(twice):

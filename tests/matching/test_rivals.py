@@ -312,7 +312,8 @@ def test_the_part_goes_on_whose_place_explains_most(broken, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("by_roads", "by_picture", "is_compared"), [(0.1, 0.1, False), (0.9, 0.1, True), (0.1, 0.9, True)]
+    ("by_roads", "by_picture", "is_compared"),
+    [(0.1, 0.1, False), (0.9, 0.1, True), (0.1, 0.9, True), (0.7, 0.1, False), (0.78, 0.1, True)],
 )
 def test_where_a_place_ended_the_search_only_others_that_explain_nearly_as_much_are_compared(
     broken, monkeypatch, by_roads, by_picture, is_compared
