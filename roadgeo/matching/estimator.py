@@ -26,12 +26,12 @@ from roadgeo.matching.growing import (
     grow_proposals,
     screen_proposals,
 )
-from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.index import ReferenceIndex, unpack_tangents
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.place import Place
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadRound, RoadSearch
-from roadgeo.matching.scene import AGREE_DEG, LEAST_SHARE, NOTICEABLE
+from roadgeo.matching.scene import AGREE_DEG, LEAST_SHARE, N_NEIGHBOURS, NOTICEABLE, Scene, query_neighbours
 from roadgeo.matching.triples import (
     BEFORE_ROADS,
     N_RAREST,
@@ -44,6 +44,7 @@ from roadgeo.matching.triples import (
     n_units,
     propose,
 )
+from roadgeo.roads.intersections import Intersections, unpack_branches
 
 __all__ = ["EQUAL", "HARDLY", "Ledger", "MatchOptions", "TripleEstimator"]
 
@@ -271,46 +272,48 @@ class TripleEstimator:
                 yield place
 
     def look_for_equals(self, place: Place, deadline: float = math.inf, beside: Sequence[TripleEstimator] = ()) -> bool:
-        """Verify where else a place's own tuples fit, on its map and on others beside, at any turn and scale; once.
+        """Verify where else the map is as in a place's frame, on it and on maps beside, at any turn and scale; once.
 
-        They are refined to the end: an equal place that grew from few intersections explains little at first. Returns
-        whether all were looked for before the deadline, by `time.perf_counter`.
+        The map's own intersections there are looked up, not the query's, of which some are false, and others lack. Such
+        places are refined to the end: one that grew from few intersections explains little at first. Returns whether
+        all were looked for before the deadline, by `time.perf_counter`.
         """
         if any(other.same(place) for other in self._equals_of):
             return True
-        there, placed = place.matches[0], dict[int, float]()
-        known = there >= 0
-        near = self.scene.neighbours[:, : _OWN_TUPLES.n_neighbours]
-        whole = known & ((known[near] & (near >= 0)).sum(axis=1) >= 2)  # a triple has two of its neighbours
-        for (proposals,) in self._own_tuples([self.index], np.flatnonzero(whole)):
-            is_own = proposals.reference == there[proposals.anchor]
+        shown, placed = map_scene(place), dict[int, float]()
+        for (proposals,) in _look_up(shown, place, self, [self]):
+            is_own = proposals.reference == shown.intersections.node[proposals.anchor]
             placed[proposals.anchor] = least = EQUAL * int(proposals.placed[is_own].max(initial=0))
-            if not self._verify_equals(place, proposals, ~is_own & (proposals.placed >= least), deadline):
+            alike = ~is_own & (proposals.placed >= least)
+            if not self._verify_alike(place, shown, proposals, alike, deadline):
                 return False
         anchors = np.array([anchor for anchor, least in placed.items() if least > 0.0][:_BESIDE], int)
-        for found in self._own_tuples([one.index for one in beside], anchors) if beside else ():
+        for found in _look_up(shown, place, self, beside, anchors) if beside else ():
             for one, proposals in zip(beside, found, strict=True):
                 alike = proposals.placed >= placed[proposals.anchor]
-                if not one._verify_equals(place, proposals, alike, deadline):
+                if not one._verify_alike(place, shown, proposals, alike, deadline):
                     return False
         self._equals_of.append(place)
         return True
 
-    def _own_tuples(self, indexes: Sequence[ReferenceIndex], anchors: IntArray) -> Iterator[list[Proposals]]:
-        """Yield where tuples of intersections of the query fit, at any turn and scale, the rarest first."""
-        camera = self.options.camera
-        scale = camera.gsd_m[0] / MAX_SCALE_RATIO, camera.gsd_m[1] * MAX_SCALE_RATIO
-        args = self.scene, indexes, scale, camera.min_shape_ratio, _OWN_TUPLES
-        return islice(propose(*args, self.sweeps.ahead, anchors), N_RAREST)
-
-    def _verify_equals(self, place: Place, proposals: Proposals, alike: BoolArray, deadline: float) -> bool:
-        """Verify places other than this one; return whether all were before the deadline."""
-        kept = self.screen(proposals, self.allow(proposals) & alike, MAX_SCREENED)
-        for other in islice(self.follow_up(proposals, kept[:MAX_GROWN]), MAX_VERIFIED):
+    def _verify_alike(
+        self, place: Place, shown: Scene, proposals: Proposals, alike: BoolArray, deadline: float
+    ) -> bool:
+        """Verify other places than a place; return whether all were verified before the deadline."""
+        self._look_for(proposals.anchor)
+        kept = screen_proposals(shown, self.index, proposals, np.flatnonzero(alike)[:MAX_SCREENED])
+        grown = grow_proposals(shown, self.index, proposals, kept[:MAX_GROWN], self.options.camera)
+        self.n_hypotheses += len(grown)
+        others = (Place(self.scene, self.index, one.matrix @ place.matrix) for one in grown)
+        distinct: list[Place] = [place]
+        for other in filter(self._is_plausible, others):
             if time.perf_counter() > deadline:
                 return False
-            if other.same(place):
+            if len(distinct) > MAX_VERIFIED:
+                break
+            if any(other.same(one) for one in (*self.whole, *distinct)):
                 continue
+            distinct.append(other)
             whole = self.refine_whole(self.settle(other)[0])
             if whole.refined is not None and self.may_be(whole.matrix):
                 self.verified.append(whole)
@@ -449,3 +452,41 @@ class TripleEstimator:
             return False
         frame_m = 2.0 * self.scene.half_size * place.gsd_m
         return place.agreement.forward >= 0.65 and bool(place.refined.corner_sigma_m.max() <= 0.005 * frame_m)
+
+
+def map_scene(place: Place) -> Scene:
+    """Return the map's intersections in a place's frame as a scene in metres, with the query's roads there.
+
+    `Intersections.node` numbers the map's intersections.
+    """
+    scene, index, to_map = place.scene, place.index, Homography(place.matrix)
+    at, (width, height) = to_map.inverse()(index.xy), scene.size
+    with np.errstate(invalid="ignore"):
+        inside = ((at >= (0.0, -height)) & (at <= (width, 0.0))).all(axis=1)
+    ids = np.flatnonzero(inside)
+    rays, tangents = unpack_branches(index.branches[ids]), unpack_tangents(index.tangents[ids])
+    points = to_map(scene.points)
+    directions = to_map(scene.points + scene.directions) - points
+    return replace(
+        scene,
+        size=(round(width * place.gsd_m), round(height * place.gsd_m)),
+        intersections=Intersections(index.xy[ids], rays, tangents, np.zeros(len(ids), np.float32), ids),
+        branches=index.branches[ids],
+        neighbours=query_neighbours(index.xy[ids], N_NEIGHBOURS),
+        points=points,
+        directions=directions / np.hypot(*directions.T)[:, None],
+    )
+
+
+def _look_up(
+    shown: Scene,
+    place: Place,
+    own: TripleEstimator,
+    estimators: Sequence[TripleEstimator],
+    anchors: IntArray | None = None,
+) -> Iterator[list[Proposals]]:
+    """Yield where the tuples of a map's intersections are found, at any turn and scale, the rarest first."""
+    low_m, high_m = own.options.camera.gsd_m
+    scale = low_m / MAX_SCALE_RATIO / place.gsd_m, high_m * MAX_SCALE_RATIO / place.gsd_m
+    args = shown, [one.index for one in estimators], scale, own.options.camera.min_shape_ratio, _OWN_TUPLES
+    return islice(propose(*args, own.sweeps.ahead, anchors), N_RAREST)
