@@ -59,7 +59,7 @@ HARDLY = 0.5
 _LEADING = 2.0
 #: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
 #: and the part of their neighbours there that an equal place has at least.
-_OWN_TUPLES, EQUAL = TripleOptions(max_hits=1_000, max_compared=40_000), 0.75
+_OWN_TUPLES, EQUAL = TripleOptions(spread=True, max_hits=1_000, max_compared=40_000), 0.75
 #: Most of them that are looked up on maps beside: each of these is looked up, and an equal place has most of them.
 _BESIDE = 3
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
@@ -128,7 +128,8 @@ class TripleEstimator:
         self._settled: dict[Place, Place] = {}  # what became of each place that was to be verified
         self._nearby: dict[Place, float] = {}
         self._fitted: list[tuple[Place, float]] = []  # through a lens, and which share of roads agreed without
-        self._equals_of: list[Place] = []  # whose own tuples were looked for elsewhere
+        self._equals_of: list[Place] = []  # like which others were looked for
+        self._equals: list[Place] = []  # that were found
         self.whole: list[Place] = []  # verified, and no better version of them is to be expected
         self.sweeps, self.scene, self.index = sweeps, sweeps.scene, index
         self.options = options or MatchOptions()
@@ -305,18 +306,16 @@ class TripleEstimator:
         grown = grow_proposals(shown, self.index, proposals, kept[:MAX_GROWN], self.options.camera)
         self.n_hypotheses += len(grown)
         others = (Place(self.scene, self.index, one.matrix @ place.matrix) for one in grown)
-        distinct: list[Place] = [place]
-        for other in filter(self._is_plausible, others):
+        known = [place, *self.whole, *self._equals]
+        new = (other for other in filter(self._is_plausible, others) if not any(map(other.same, known)))
+        for other in islice(new, MAX_VERIFIED):
             if time.perf_counter() > deadline:
                 return False
-            if len(distinct) > MAX_VERIFIED:
-                break
-            if any(other.same(one) for one in (*self.whole, *distinct)):
-                continue
-            distinct.append(other)
             whole = self.refine_whole(self.settle(other)[0])
+            known.append(whole)
             if whole.refined is not None and self.may_be(whole.matrix):
                 self.verified.append(whole)
+                self._equals.append(whole)
         return True
 
     def settle(self, place: Place) -> tuple[Place, float]:
