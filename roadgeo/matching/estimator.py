@@ -57,10 +57,10 @@ HARDLY = 0.5
 #: A place that leads all earlier places by this score is compared with places nearby; if it leads these too, a lens is
 #: tried. The weakest of ten right places with a lens, or fitted to a part only, led by 3.2.
 _LEADING = 2.0
-#: How intersections of a place, those with the rarest tuples, are looked up elsewhere on the map before it is accepted;
-#: and the part of their neighbours there that an equal place has at least.
-_OWN_TUPLES, EQUAL = TripleOptions(spread=True, max_hits=1_000, max_compared=40_000), 0.75
-#: Most of them that are looked up on maps beside: each of these is looked up, and an equal place has most of them.
+#: How the map's intersections at a place, spread over the frame, are looked up elsewhere before it is accepted; and the
+#: part of their neighbours there that an equal place has at least.
+_OWN_TRIPLES, EQUAL = TripleOptions(spread=True, max_hits=1_000, max_compared=40_000), 0.75
+#: Most of them that are looked up on other maps: an equal place has nearly all of them.
 _BESIDE = 3
 #: Approximate seconds of each step, measured on lattices, where searches are longest: looking up an intersection of the
 #: query, a map triple like a query triple, screening or voting for a place, growing a hypothesis by intersections and
@@ -282,20 +282,29 @@ class TripleEstimator:
         if any(other.same(place) for other in self._equals_of):
             return True
         shown, placed = map_scene(place), dict[int, float]()
-        for (proposals,) in _look_up(shown, place, self, [self]):
+        for (proposals,) in self._look_up(shown, place.gsd_m, [self.index]):
             is_own = proposals.reference == shown.intersections.node[proposals.anchor]
             placed[proposals.anchor] = least = EQUAL * int(proposals.placed[is_own].max(initial=0))
             alike = ~is_own & (proposals.placed >= least)
             if not self._verify_alike(place, shown, proposals, alike, deadline):
                 return False
         anchors = np.array([anchor for anchor, least in placed.items() if least > 0.0][:_BESIDE], int)
-        for found in _look_up(shown, place, self, beside, anchors) if beside else ():
+        for found in self._look_up(shown, place.gsd_m, [one.index for one in beside], anchors) if beside else ():
             for one, proposals in zip(beside, found, strict=True):
                 alike = proposals.placed >= placed[proposals.anchor]
                 if not one._verify_alike(place, shown, proposals, alike, deadline):
                     return False
         self._equals_of.append(place)
         return True
+
+    def _look_up(
+        self, shown: Scene, gsd_m: float, indexes: Sequence[ReferenceIndex], anchors: IntArray | None = None
+    ) -> Iterator[list[Proposals]]:
+        """Yield where triples of a map's intersections are found on maps, at any turn and scale, for some anchors."""
+        camera = self.options.camera
+        scale = camera.gsd_m[0] / MAX_SCALE_RATIO / gsd_m, camera.gsd_m[1] * MAX_SCALE_RATIO / gsd_m
+        args = shown, indexes, scale, camera.min_shape_ratio, _OWN_TRIPLES
+        return islice(propose(*args, self.sweeps.ahead, anchors), N_RAREST)
 
     def _verify_alike(
         self, place: Place, shown: Scene, proposals: Proposals, alike: BoolArray, deadline: float
@@ -475,17 +484,3 @@ def map_scene(place: Place) -> Scene:
         points=points,
         directions=directions / np.hypot(*directions.T)[:, None],
     )
-
-
-def _look_up(
-    shown: Scene,
-    place: Place,
-    own: TripleEstimator,
-    estimators: Sequence[TripleEstimator],
-    anchors: IntArray | None = None,
-) -> Iterator[list[Proposals]]:
-    """Yield where the tuples of a map's intersections are found, at any turn and scale, the rarest first."""
-    low_m, high_m = own.options.camera.gsd_m
-    scale = low_m / MAX_SCALE_RATIO / place.gsd_m, high_m * MAX_SCALE_RATIO / place.gsd_m
-    args = shown, [one.index for one in estimators], scale, own.options.camera.min_shape_ratio, _OWN_TUPLES
-    return islice(propose(*args, own.sweeps.ahead, anchors), N_RAREST)

@@ -216,7 +216,7 @@ class Rivals:
         return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
 
     def _among_equals(self, part: Search[Place]) -> Place | None:
-        """Compare the likeliest place of a part; where it leads, also with the places that its own tuples fit."""
+        """Compare the likeliest place of a part; where it leads, also with places where the map is as it is there."""
         place = self._by_roads(part)
         if place is None or place.score < self.needed:
             return place

@@ -1,5 +1,6 @@
-"""Equal places, on one map or several: what a place's own tuples fit elsewhere, at any turn and scale, is its rival."""
+"""Equal places, on one map or several: where the map is as it is at a place, at any turn and scale, is its rival."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Whole
 from roadgeo.matching.place import Place
 from roadgeo.matching.scene import Query
+from roadgeo.matching.shifts import shifted
 from roadgeo.matching.verdict import _stand_out, decide
 from roadgeo.roads.network import build_network
 
@@ -42,7 +44,7 @@ def twice():
     return Query("frame", scene, graph, Seconds()), build_index(network), there
 
 
-def test_what_the_tuples_of_a_place_fit_elsewhere_is_verified_once(twice):
+def test_where_the_map_is_as_it_is_at_a_place_is_verified_once(twice):
     query, index, there = twice
     estimator = estimator_of(query.scene, index)
     place, _ = estimator.settle(Place(query.scene, index, TRUTH))
@@ -104,3 +106,25 @@ def test_two_places_stand_out_that_explain_much_and_alike_and_more_than_all_othe
     index = SimpleNamespace(is_of_map=lambda _: True)
     best, rival = (SimpleNamespace(log10_likelihood=worth, score=-0.1, index=index) for worth in likelihoods)
     assert _stand_out(best, rival, [SimpleNamespace(score=score) for score in others], 3.5) is stand_out
+
+
+def test_what_a_mask_lacks_and_shows_falsely_hides_no_equal_place(twice):
+    """No intersection of the mask is one of the map's: the map's own are looked up."""
+    query, index, there = twice
+    scene = query.scene
+    wrong = replace(scene.intersections, tangents=scene.intersections.tangents[::-1].copy())
+    worn = replace(scene, intersections=wrong, branches=scene.branches[::-1].copy())
+    estimator = estimator_of(worn, index)
+    place, _ = estimator.settle(Place(worn, index, TRUTH))
+    estimator.look_for_equals(place)
+    assert any(np.hypot(*(other.center - there)) < 5.0 for other in estimator.verified)
+    n_equal = sum(np.hypot(*(other.center - there)) < 5.0 for other in estimator.verified)
+    assert n_equal <= 2  # as it was met, and refined to the end: others are not crowded out
+
+
+def test_where_the_map_has_no_intersections_nothing_is_looked_up(twice):
+    query, index, _ = twice
+    nowhere = Place(query.scene, index, shifted(TRUTH, 90_000.0, 0.0))
+    estimator = estimator_of(query.scene, index)
+    assert estimator.look_for_equals(nowhere)
+    assert estimator.verified == []
