@@ -26,6 +26,7 @@ from roadgeo.matching import (
     scene,
     triples,
     verdict,
+    veto,
 )
 from roadgeo.matching.index import COARSENESS
 from roadgeo.matching.methods import N_PLACES
@@ -82,6 +83,7 @@ FROM_CODE = [
     (SECTION_8, r"and (half) of the lesser one", rivals._AGREEING),
     (SECTION_8, r"or the blocks beside it, by 10\^(\d+) is", rivals._CERTAIN),
     (SECTION_8, r"met is less than (half) of the score needed", rivals._MAY_LEAD),
+    (SECTION_8, r"explain more by 10\^([\d.]+) refuses", veto._MORE),
     (SECTION_8, r"Two places agree with (\d+) % of the roads", round(100 * verdict._LIKE_THE_TRUTH)),
     (SECTION_8, r"A lead of 10\^([\d.]+) or more", NEEDED),
     ("docs/faq.md", r"A place is reported from ([\d.]+) on", NEEDED),
