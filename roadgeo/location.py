@@ -76,7 +76,7 @@ ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
         ErrorRate(15.0, 2359, 0, 0.00156),
     ),
     "soft mask": (ErrorRate(3.5, 11, 1, 0.413), ErrorRate(8.0, 59, 0, 0.0606), ErrorRate(15.0, 163, 0, 0.0224)),
-    "hints": (ErrorRate(3.5, 15, 0, 0.218), ErrorRate(15.0, 125, 0, 0.0291)),
+    "hints": (ErrorRate(3.5, 17, 0, 0.195), ErrorRate(15.0, 123, 0, 0.0295)),
     "photograph": (ErrorRate(3.5, 32, 0, 0.109),),
 }
 
