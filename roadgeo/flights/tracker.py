@@ -35,9 +35,17 @@ from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
 
 __all__ = [
-    "AROUND", "Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "latest",
+    "AROUND",
+    "Fix",
+    "FlightFrame",
+    "FrameStatus",
+    "TrackOptions",
+    "Tracked",
+    "Tracker",
+    "follow",
+    "latest",
     "why_refused",
-]  # fmt: skip
+]
 
 #: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25

@@ -194,7 +194,8 @@ class TripleEstimator:
                 self._count(n_tried, "roads")
                 self.n_hypotheses += n_proposed
                 self._n_by_roads += n_proposed
-                self._look_for(anchor)
+                self._n_rounds += 1
+                self._anchors.add(anchor)
                 self.events.note("voted", anchor, n_proposed)
                 for place in grown:
                     is_met = any(self._is_met_again(other, place) for other in met)
@@ -215,11 +216,6 @@ class TripleEstimator:
         for rounds in zip_longest(*(search.rounds() for search in searches)):
             yield [one for one in rounds if one is not None]
 
-    def _look_for(self, anchor: int) -> None:
-        """Count an intersection of the query that is looked up on the map."""
-        self._n_rounds += 1
-        self._anchors.add(anchor)
-
     def _is_plausible(self, place: Place) -> bool:
         """Return whether a camera can have seen a place that grew."""
         fault = self.judge(place.matrix, rough=True)
@@ -238,14 +234,18 @@ class TripleEstimator:
 
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
-        self._look_for(proposals.anchor)
+        self._anchors.add(proposals.anchor)
+        kept = self._screen(self.scene, proposals, allowed, most)
+        self.events.note("screened", proposals, allowed, kept)
+        return kept
+
+    def _screen(self, scene: Scene, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
+        self._n_rounds += 1
         self.n_tuples += proposals.n_tuples
         self.n_candidates += proposals.n_hits
         looked_at = np.flatnonzero(allowed)[:most]
         self._count(len(looked_at), "triples")
-        kept = screen_proposals(self.scene, self.index, proposals, looked_at)
-        self.events.note("screened", proposals, allowed, kept)
-        return kept
+        return screen_proposals(scene, self.index, proposals, looked_at)
 
     def allow(self, proposals: Proposals) -> BoolArray:
         """Return which proposals put the middle of the frame, and its up direction, within the limits."""
@@ -310,10 +310,9 @@ class TripleEstimator:
         self, place: Place, shown: Scene, proposals: Proposals, alike: BoolArray, deadline: float
     ) -> bool:
         """Verify other places than a place; return whether all were verified before the deadline."""
-        self._look_for(proposals.anchor)
-        kept = screen_proposals(shown, self.index, proposals, np.flatnonzero(alike)[:MAX_SCREENED])
-        grown = grow_proposals(shown, self.index, proposals, kept[:MAX_GROWN], self.options.camera)
-        self.n_hypotheses += len(grown)
+        kept = self._screen(shown, proposals, alike, MAX_SCREENED)[:MAX_GROWN]
+        self.n_hypotheses += len(kept)
+        grown = grow_proposals(shown, self.index, proposals, kept, self.options.camera)
         others = (Place(self.scene, self.index, one.matrix @ place.matrix) for one in grown)
         known = [place, *self.whole, *self._equals]
         new = (other for other in filter(self._is_plausible, others) if not any(map(other.same, known)))

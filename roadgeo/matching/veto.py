@@ -74,31 +74,31 @@ def contest(
     if free is None or leading.counts["searched"] == 0 or options.method == "pair":
         return list(hinted)
     best = next(iter(leading.places), None)
-    fewer, others = [free], list[Place]()
-    is_reported = best is not None and best.score >= needed
-    if best is not None and is_reported:
-        fewer.append(_alike(best, free))
-        others += [place for place in places_beside(best, free.match) if broken_hints(place, options)]
+    reported = best if best is not None and best.score >= needed else None
+    if reported is not None:
+        fewer = [free, _alike(reported, free)]
+        others = [place for place in places_beside(reported, free.match) if broken_hints(place, options)]
     else:
         brief = replace(free.search, work_limit_s=min(_BRIEFLY_S, free.search.work_limit_s))
-        fewer = [replace(free, effort="quick", search=brief)]
+        fewer, others = [replace(free, effort="quick", search=brief)], []
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     here = [part for part in parts if may_show(part, options, frame_m)]  # no other was opened
     time_limit_s -= sum(result.seconds.total for result in hinted)
-    spent_s, cut = 0.0, False
+    spent_s, is_cut = 0.0, False
     for known in fewer:
         results = search_references(query, here, known, max(time_limit_s - spent_s, 0.0))
         spent_s += sum(result.seconds.total for result in results)
         standing = [place for result in results for place in result.places[:1] if place.score >= needed]
-        others += [place for result in results for place in result.likeliest] if is_reported else standing
+        others += standing if reported is None else [place for result in results for place in result.likeliest]
         better = _better(best, others)
         if better is not None and not broken_hints(better, options):  # hints led past it
             return results
-        cut = any(result.stopped == "time" for result in results)
-        if better is not None or standing or cut:
+        if better is not None or standing:
             break
-    is_unproved = better is None and is_reported and cut
-    contested = _unproved(leading) if is_unproved else replace(leading, better=better)
+        is_cut = any(result.stopped == "time" for result in results)
+        if is_cut:
+            break
+    contested = _unproved(leading) if reported is not None and is_cut else replace(leading, better=better)
     return [contested.later(spent_s) if result is leading else result for result in hinted]
 
 

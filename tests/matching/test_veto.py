@@ -127,6 +127,14 @@ def test_where_time_ends_before_the_search_without_hints_the_place_is_not_report
     assert "without the hints" in location.reason
 
 
+def test_where_time_ends_a_search_without_hints_that_led_to_the_place_it_stands(town, monkeypatch):
+    _, index = town
+    options = hinted(town)
+    (best, *_) = found(town, options)
+    monkeypatch.setattr(veto, "search_references", lambda *_: [Searched(index, (best,), stopped="time")])
+    assert answer(town, options, [best]).located
+
+
 @pytest.mark.parametrize(
     ("score", "near_m", "where"),
     [
