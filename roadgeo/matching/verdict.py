@@ -25,7 +25,7 @@ from roadgeo.matching.place import Place
 from roadgeo.matching.scene import NOTICEABLE, Query, Scene
 from roadgeo.matching.veto import broken_hints, without_hints
 
-__all__ = ["away", "decide", "georeference", "match_again", "searched_within"]
+__all__ = ["away", "decide", "georeference", "how_clear", "match_again", "searched_within"]
 
 
 #: Reason if the clock ended a search: the only case in which an answer depends on the machine and its load.
@@ -288,7 +288,7 @@ def _why_nothing(
         given += ["in the area given by within"] * (options.match.within is not None)
         return Reason.FEW_NEAR, f"no map has an intersection {' and '.join(given)}{within}"
     score = listed[0].score if listed else -math.inf
-    best = _lead(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
+    best = how_clear(score, options.min_log10_odds) if math.isfinite(score) else "none fits"
     if nearest.stopped == "work":
         stopped = f"stopped after as much work as a search may take; of the places tried, {best}{within}"
         return Reason.TIME_LIMIT, f"{stopped}; {_how_far(query, nearest, options)}"
@@ -328,8 +328,8 @@ def _what_may_help(listed: Sequence[Place], options: LocateOptions) -> str:
     return f"{', '.join(helps + others)} or another map may help"
 
 
-def _lead(score: float, needed: float) -> str:
-    """Describe how far the best place leads."""
+def how_clear(score: float, needed: float) -> str:
+    """Describe how far the best place of a refusal leads."""
     if score < 0.2:
         return "another fits as well as the best"
     return f"the best has a score of {math.floor(10.0 * score) / 10.0:g}, {needed:g} is asked for"

@@ -20,6 +20,7 @@ from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Content, Location, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.verdict import how_clear
 from roadgeo.reference.opening import AnyReference
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
@@ -140,13 +141,17 @@ def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -
 
 
 def _discount(location: Location, what: str, tried: int, options: LocateOptions) -> Location:
-    """Take log10 of the number of passes off the scores; a place that then scores too little is not located."""
+    """Take log10 of the number of passes off the scores; what was located and then scores too little is refused."""
     if tried == 1 or location.log10_odds is None:
         return location
+    needed, said = options.min_log10_odds, location.places[0].score
     places = tuple(_less_sure(place, math.log10(tried)) for place in location.places)
     location = replace(location, places=places)
-    if places[0].score >= options.min_log10_odds or location.place is None:
-        return location if location.place is None else location.saying(f"{_in_ways(tried)}, here at {what}")
+    if location.place is None:
+        left = how_clear(places[0].score, needed)
+        return replace(location, reason=location.reason.replace(how_clear(said, needed), left))
+    if places[0].score >= needed or not location.located:
+        return location.saying(f"{_in_ways(tried)}, here at {what}")
     few = f"one place stands out, at {what}, but not clearly enough"
     return replace(location, status="not_located", reason=few, reason_code=Reason.TOO_MANY_LOOKS)
 

@@ -10,6 +10,7 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Reason, Spent, Stats
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.verdict import how_clear
 from roadgeo.running.passes import PassRoads, locate_passes
 
 OPTIONS = LocateOptions()
@@ -90,6 +91,23 @@ def test_no_pass_is_taken_when_the_time_is_gone():
     location, limits = take(found("not_located", seconds=9.8), found())
     assert location.status == "not_located"
     assert len(limits) == 1
+
+
+@pytest.mark.parametrize(("odds", "said"), [(3.0, "a score of 2.6, 3.5"), (0.3, "another fits as well")])
+def test_a_refusal_states_the_score_that_it_lists(odds, said):
+    refused = replace(found(odds=odds), status="not_located", reason=f"none: {how_clear(odds, 3.5)}; more may help")
+    location, _ = take(MaskError("no road"), refused)
+    assert location.log10_odds == pytest.approx(odds - np.log10(2))
+    assert said in location.reason
+    assert "more may help" in location.reason
+
+
+def test_what_is_ambiguous_stays_so_in_a_later_pass():
+    """It had no score that could be lost: its places are equal."""
+    equal = replace(found("ambiguous", odds=0.4), reason="streets repeat", reason_code=Reason.TWO_PLACES)
+    location, _ = take(found("not_located"), equal)
+    assert (location.status, location.reason_code) == ("ambiguous", Reason.TWO_PLACES)
+    assert location.reason == "streets repeat; its roads were traced in 2 ways, here at pass 1"
 
 
 def test_two_passes_at_two_places_are_ambiguous():
