@@ -59,10 +59,6 @@ N_LIKELIEST = 12
 #: Two places are different if their middles are further apart than this share of half the frame's diagonal, and they
 #: share less than this share of the roads met (see `Evidence.shared`), unless the other place explains more.
 _APART, _SAME = 0.04, 0.67
-#: Where traced roads and a soft picture favour the same place, this part of the lesser lead counts as well, for they
-#: are not independent; where they favour different places, it counts against.
-#: A place that traced roads speak against is not the picture's to decide: a grid that equals its mirror image fits.
-_AGREEING = 0.5
 #: The blocks beside a place (farther where the frame is large), and the streets around it, where the lead over places
 #: near may be enough.
 _NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
@@ -105,7 +101,7 @@ class Rivals:
         best = max(parts, key=self._explained)
         if max((place.score for place in self.estimators[best].verified), default=-math.inf) < self.needed:
             return None  # a place that was met is already too good a rival
-        place = self._among_equals(best)
+        place = self._among_equals(best, self._by_roads)
         if place is None or place.score < 2.0 * self.needed:
             return None
         others = (self.estimators[part].verified for part in parts if part is not best)
@@ -166,7 +162,17 @@ class Rivals:
 
     def compare(self, part: Search[Place]) -> Place | None:
         """Return the likeliest place of a part, scored against its best rival; None if no place was verified."""
-        by_roads, estimator = self._among_equals(part), self.estimators[part]
+        return self._among_equals(part, self._by_roads_and_picture)
+
+    def _by_roads_and_picture(self, part: Search[Place]) -> Place | None:
+        """Compare the likeliest place of a part with its best rival, by traced roads; by a soft picture, too.
+
+        Where they favour the same place, the lesser lead counts as far as the best rival leaves traced roads
+        unexplained: in a lattice both lead by the same few streets. Where they favour different places, it counts
+        against: a grid that equals its mirror image fits, and a place that traced roads speak against is not the
+        picture's to decide.
+        """
+        by_roads, estimator = self._by_roads(part), self.estimators[part]
         is_drawn = estimator.scene.probability is None
         if by_roads is None or by_roads.score >= _CERTAIN or is_drawn or time.perf_counter() > self._deadline:
             return by_roads
@@ -175,8 +181,8 @@ class Rivals:
         self._pictured[by_roads, *estimator.verified] = by_picture  # a rival may have been verified meanwhile
         part.seconds += time.perf_counter() - started
         best, other = sorted((by_roads, by_picture), key=lambda place: -place.score)
-        is_same, lesser = best.same(other), max(other.score, 0.0)
-        return best.but(score=best.score + (_AGREEING if is_same else -1.0) * lesser)
+        counts = _unexplained(by_roads) if best.same(other) else -1.0
+        return best.but(score=best.score + counts * max(other.score, 0.0))
 
     @property
     def _by_chance(self) -> float:
@@ -215,16 +221,16 @@ class Rivals:
         score = max(lead - _penalty(best), 0.0) - self._by_chance
         return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
 
-    def _among_equals(self, part: Search[Place]) -> Place | None:
+    def _among_equals(self, part: Search[Place], compare: Callable[[Search[Place]], Place | None]) -> Place | None:
         """Compare the likeliest place of a part; where it leads, also with places where the map is as it is there."""
-        place = self._by_roads(part)
+        place = compare(part)
         if place is None or place.score < self.needed:
             return place
         own = self.estimators[part]
         beside = [estimator for estimator in self.estimators.values() if estimator is not own]
         if not own.look_for_equals(place, self._deadline, beside):
             return place.but(score=min(place.score, 0.0))
-        return self._by_roads(part)
+        return compare(part)
 
     def _by_roads(self, part: Search[Place]) -> Place | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""
@@ -321,6 +327,12 @@ def _surroundings(place: Place) -> tuple[LocalSearchOptions, LocalSearchOptions]
 def _is_beaten(place: Place) -> bool:
     """Return whether a place's rival explains more."""
     return place.rival is not None and place.rival.log10_likelihood > place.log10_likelihood
+
+
+def _unexplained(place: Place) -> float:
+    """Return the share of a place's likelihood that its best rival lacks."""
+    rival = 0.0 if place.rival is None else place.rival.log10_likelihood
+    return min(max(1.0 - rival / max(place.log10_likelihood, 1e-9), 0.0), 1.0)
 
 
 def _lead(place: Place, other: Place) -> float:

@@ -80,7 +80,6 @@ FROM_CODE = [
         r"So beyond 10\^(\d+) the lead is (\d+) times the part",
         (picture._MOST_LIKELIHOOD, picture._MOST_LIKELIHOOD),
     ),
-    (SECTION_8, r"and (half) of the lesser one", rivals._AGREEING),
     (SECTION_8, r"or the blocks beside it, by 10\^(\d+) is", rivals._CERTAIN),
     (SECTION_8, r"met is less than (half) of the score needed", rivals._MAY_LEAD),
     (SECTION_8, r"explain more by 10\^([\d.]+) refuses", veto._MORE),

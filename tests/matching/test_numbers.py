@@ -95,21 +95,18 @@ def scored(place, score):
     return place.but(score=score, rival=None)
 
 
-@pytest.mark.parametrize(("by_picture", "score"), [(4.0, 6.0 + 0.5 * 4.0), (9.0, 9.0 + 0.5 * 6.0), (-5.0, 6.0)])
-def test_half_of_the_lesser_lead_counts_where_roads_and_a_soft_picture_agree(lattice, monkeypatch, by_picture, score):
+def test_the_picture_is_asked_where_traced_roads_lead_by_less_than_12(lattice, monkeypatch):
     truth, index, evidence = lattice
     estimator = estimator_of(evidence.scene, index)
     estimator.scene = replace(evidence.scene, probability=np.zeros((2, 2), np.float32))
     place, part = Place(evidence.scene, index, truth), Search(estimator)
     compared = Rivals({part: estimator}, Ledger(n_reference=866), 3.5)
-    monkeypatch.setattr(compared, "_among_equals", lambda _: scored(place, 6.0))
-    monkeypatch.setattr(compared, "_by_picture", lambda _: scored(place, by_picture))
-    assert compared.compare(part).score == pytest.approx(score)
-    monkeypatch.setattr(compared, "_among_equals", lambda _: scored(place, 12.0))  # certain: no picture is asked
-    assert compared.compare(part).score == 12.0
     elsewhere = Place(evidence.scene, index, shifted(truth, 400.0, 0.0))
-    monkeypatch.setattr(compared, "_among_equals", lambda _: scored(place, 11.9))
+    monkeypatch.setattr(estimator, "look_for_equals", lambda *_: True)
     monkeypatch.setattr(compared, "_by_picture", lambda _: scored(elsewhere, 4.0))
+    monkeypatch.setattr(compared, "_by_roads", lambda _: scored(place, 12.0))
+    assert compared.compare(part).score == 12.0
+    monkeypatch.setattr(compared, "_by_roads", lambda _: scored(place, 11.9))
     assert compared.compare(part).score == pytest.approx(7.9)
 
 

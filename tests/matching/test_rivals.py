@@ -294,7 +294,7 @@ def test_a_map_that_was_searched_to_its_end_needs_no_double_lead(broken, monkeyp
             monkeypatch.setitem(one.index.meta, "shard_of", "a large map")
     asked = Rivals({item: estimator, beside_it: other}, Ledger(n_reference=866), NEEDED)
     place = item.best.but(score=lead * NEEDED)
-    monkeypatch.setattr(Rivals, "_among_equals", lambda self, part: place)
+    monkeypatch.setattr(Rivals, "_among_equals", lambda self, part, compare: place)
     assert not asked.stands(item)  # it may go on
     item.stopped = "exhausted"
     assert asked.stands(item) == stands
@@ -377,26 +377,50 @@ def test_beside_a_place_is_never_farther_than_around_it(broken):
 
 
 @pytest.mark.parametrize(
-    ("by_roads", "by_picture", "is_same", "lead"),
+    ("by_roads", "explains", "by_picture", "is_same", "lead"),
     [
-        (2.0, 5.0, True, 6.0),  # half of the lesser lead counts as well
-        (5.0, 2.0, True, 6.0),
-        (2.0, 5.0, False, 3.0),  # or against
-        (-1.0, 5.0, False, 5.0),
-        (-1.0, 5.0, True, 5.0),
-        (13.0, None, True, 13.0),  # beyond doubt: the picture is not asked
+        (2.0, 0.6, 5.0, True, 5.8),  # the lesser lead counts by what the best rival leaves unexplained
+        (5.0, 0.6, 2.0, True, 5.8),
+        (5.0, 0.0, 2.0, True, 7.0),
+        (5.0, 1.0, 2.0, True, 5.0),
+        (2.0, 0.6, 5.0, False, 3.0),  # or against
+        (-1.0, 0.6, 5.0, False, 5.0),
+        (-1.0, 1.2, 5.0, True, 5.0),
+        (13.0, 0.6, None, True, 13.0),  # beyond doubt: the picture is not asked
     ],
 )
-def test_traced_roads_and_a_soft_picture_count_together(plain, monkeypatch, by_roads, by_picture, is_same, lead):
+def test_traced_roads_and_a_soft_picture_count_together(
+    plain, monkeypatch, by_roads, explains, by_picture, is_same, lead
+):
     truth, index, evidence = plain
     soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
     elsewhere = move_about(Homography(truth)(soft.center), Shift(700.0, 300.0, 0.0, 1.0, 0.0)) @ truth
     estimator = estimator_of(soft, index)
     item = Search(estimator)
     here, there = (Place(soft, index, matrix) for matrix in (truth, truth if is_same else elsewhere))
-    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads))
+    rival = here.but(by=Weight(explains * here.log10_likelihood, 1.0))
+    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads, rival=rival))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
+    monkeypatch.setattr(estimator, "look_for_equals", lambda *_: True)
     assert Rivals({item: estimator}, Ledger(1), NEEDED).compare(item).score == pytest.approx(lead)
+
+
+def test_what_leads_only_by_the_picture_is_looked_up_elsewhere(plain, monkeypatch):
+    truth, index, evidence = plain
+    soft = replace(evidence.scene, probability=np.full(evidence.scene.field.shape, 0.1, np.float32))
+    estimator, here = estimator_of(soft, index), Place(soft, index, truth)
+    item, looked_for = Search(estimator), []
+
+    def look_for_equals(place, *_):
+        looked_for.append(place.score)
+        return True
+
+    monkeypatch.setattr(estimator, "look_for_equals", look_for_equals)
+    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=0.5 * NEEDED, rival=None))
+    monkeypatch.setattr(Rivals, "_by_picture", lambda *_: here.but(score=NEEDED - 0.5 * len(looked_for)))
+    found = Rivals({item: estimator}, Ledger(1), NEEDED).compare(item)
+    assert looked_for == [pytest.approx(1.5 * NEEDED)]
+    assert found.score == pytest.approx(1.5 * NEEDED - 0.5)
 
 
 @pytest.mark.parametrize(("by", "n_compared"), [(-1.0, 1), (1.0, 1), (4.0, 2)])
