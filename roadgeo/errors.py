@@ -66,6 +66,8 @@ class Reason(StrEnum):
     TIME_LIMIT = "time_limit"
     #: The roads fit better at a place that the hints exclude.
     FITS_ELSEWHERE = "fits_elsewhere"
+    #: The roads fit better with the image mirrored, left to right.
+    MIRRORED = "mirrored"
     #: No place explains clearly more than others do.
     NOTHING_STANDS_OUT = "nothing_stands_out"
     #: Something did, but not by enough for all the looks that were taken.

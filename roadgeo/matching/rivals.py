@@ -63,6 +63,8 @@ _APART, _SAME = 0.04, 0.67
 #: near may be enough.
 _NEARBY = LocalSearchOptions(reach_m=500.0, turn_deg=0.0, n_places=N_CLOSELY)
 _AROUND = replace(_NEARBY, reach_m=4000.0, n_places=LocalSearchOptions.n_places)
+#: Mirrors nothing (see `similar_places`).
+_AS_SEEN = np.eye(3)
 
 
 class Compared(NamedTuple):
@@ -94,6 +96,7 @@ class Rivals:
         self._deadline = time.perf_counter() + time_limit_s
         self._compared: dict[tuple[Place, ...], Place] = {}  # by the place and those that were met
         self._pictured: dict[tuple[Place, ...], Place] = {}  # by the place by roads and those that were verified
+        self._over_mirrored: list[tuple[Place, float]] = []  # and its lead over the mirrored query beside it
         self._similar: dict[tuple[Place, LocalSearchOptions], list[Compared]] = {}  # by the place, and how far around
 
     def __call__(self, parts: Sequence[Search[Place]]) -> Search[Place] | None:
@@ -222,7 +225,10 @@ class Rivals:
         return best.but(score=score, rival=rival, by=Weight(likelihood, picture.statement_px))
 
     def _among_equals(self, part: Search[Place], compare: Callable[[Search[Place]], Place | None]) -> Place | None:
-        """Compare the likeliest place of a part; where it leads, also with places where the map is as it is there."""
+        """Compare the likeliest place of a part; where it leads, also with places where the map is as it is there.
+
+        A place where the mirrored query fits better is none.
+        """
         place = compare(part)
         if place is None or place.score < self.needed:
             return place
@@ -230,7 +236,18 @@ class Rivals:
         beside = [estimator for estimator in self.estimators.values() if estimator is not own]
         if not own.look_for_equals(place, self._deadline, beside):
             return place.but(score=min(place.score, 0.0))
-        return compare(part)
+        place = compare(part)
+        return place if place is None else self._unless_mirrored(place, own.options)
+
+    def _unless_mirrored(self, place: Place, match: MatchOptions) -> Place:
+        """Return a place; with a fault, and no lead, if the mirrored query beside it leads it by the score needed."""
+        if not self.needed <= place.score < _CERTAIN:
+            return place
+        lead = next((lead for other, lead in self._over_mirrored if other.same(place)), None)
+        if lead is None:
+            lead = place.agreement.log10_likelihood - mirrored_likelihood(place, match)
+            self._over_mirrored.append((place, lead))
+        return place if lead > -self.needed else place.but(score=lead, fault=CameraFault.MIRRORED)
 
     def _by_roads(self, part: Search[Place]) -> Place | None:
         """Compare the likeliest place of a part with its best rival, by traced roads."""
@@ -359,22 +376,26 @@ def similar_places(
     compare: Callable[[FloatArray], tuple[float, float]],
     match: MatchOptions,
     around: LocalSearchOptions = _AROUND,
+    mirror: FloatArray = _AS_SEEN,
 ) -> list[Compared]:
-    """Return other places around a place that fit most roads; the likeliest are fully refined."""
+    """Return other places around a place that fit most roads; the likeliest are fully refined.
+
+    `mirror` (3, 3) mirrors the query plane about the middle of the frame: places of the mirrored query are returned.
+    """
     scene, index = best.scene, best.index
     drawn: Drawn = {}
     proposed: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
-        turned = move_about(best.center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ best.matrix
-        if judge(turned, scene.size, match.camera) is CameraFault.HEADING:
+        turned = move_about(best.center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ best.matrix @ mirror
+        if judge(turned @ mirror, scene.size, match.camera) is CameraFault.HEADING:
             continue
         shifts = search_nearby(turned, scene, index, around, drawn)
         proposed += [(shift.share, move_about(best.center, shift) @ turned) for shift in shifts]
     proposed.sort(key=lambda place: -place[0])
     starts = (Place(scene, index, matrix) for _, matrix in proposed[: around.n_places])
-    fits = (fitted(start, match, N_ROUGHLY) for start in starts)
+    fits = (fitted(start, match, N_ROUGHLY, mirror) for start in starts)
     roughly = sorted((Compared(fit, *compare(fit.matrix)) for fit in fits), key=lambda other: -other.log10_likelihood)
-    finely = (fitted(other.place, match, None) for other in roughly[:N_CLOSELY])
+    finely = (fitted(other.place, match, None, mirror) for other in roughly[:N_CLOSELY])
     return [*(Compared(fit, *compare(fit.matrix)) for fit in finely), *roughly[N_CLOSELY:]]
 
 
@@ -402,11 +423,27 @@ def log10_gap(best: float, others: Sequence[float]) -> float:
     return n * math.log10(1.0 + gap / (n * max(usual, _LEAST_SPACING)))
 
 
-def fitted(start: Place, match: MatchOptions, n_points: int | None) -> Place:
-    """Return a place refined; the start if the refinement diverges."""
+def mirrored_likelihood(place: Place, match: MatchOptions) -> float:
+    """Return the log10 likelihood of the best place of the mirrored query beside a place, by that one's yardstick.
+
+    The query is mirrored along its streets: a grid then runs as it does.
+    """
+    scene, camera = place.scene, replace(match.camera, heading_deg=None, north_up=False)
+    east, north = scene.directions.T
+    twice = np.angle((scene.weights * np.exp(4j * np.arctan2(north, east))).sum()) / 2.0
+    linear = np.array([[math.cos(twice), math.sin(twice)], [math.sin(twice), -math.cos(twice)]])
+    mirror = np.eye(3)
+    mirror[:2] = np.column_stack((linear, scene.center - linear @ scene.center))
+    args = place, place.evidence.compared_with(place.matrix), replace(match, camera=camera)
+    mirrored = similar_places(*args, _surroundings(place)[0], mirror)
+    return max((other.log10_likelihood for other in mirrored), default=-math.inf)
+
+
+def fitted(start: Place, match: MatchOptions, n_points: int | None, mirror: FloatArray = _AS_SEEN) -> Place:
+    """Return a place refined; the start if the refinement diverges. `mirror`: as in `similar_places`."""
     args = start.matrix, start.scene, start.index, start.matched
     refined = refine(*args, match.refine, n_points, held=True)
-    if refined is None or judge(refined.matrix, start.scene.size, match.camera) is not None:
+    if refined is None or judge(refined.matrix @ mirror, start.scene.size, match.camera) is not None:
         return start
     place = start.at(refined)
     return start if abs(math.log(place.gsd_m / start.gsd_m)) > math.log(1.1) else place

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.homography import Homography, shift
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
@@ -51,6 +51,7 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
 
     ===========================================================  ===========================
     the roads fit better where the hints exclude (`veto`)        not located, fits_elsewhere
+    the roads fit better with the query mirrored                 not located, mirrored
     no score of S, but two places agree in whole, or lead all    ambiguous, two_places
     no score of S                                                not located (`_why_nothing`)
     a place that leads another map by S lowers the score below   ambiguous, two_places
@@ -70,7 +71,7 @@ def _judge(query: Query, searched: Sequence[Searched], options: LocateOptions) -
     needed = options.min_log10_odds
     listed = _listed(searched, compared)
     rival = None if best is None else _equal(best, rivals, listed, needed)
-    if best is None or (best.score < needed and rival is None):
+    if best is None or best.fault is CameraFault.MIRRORED or (best.score < needed and rival is None):
         return _refuse(location, query, searched, listed, options)
     best = _against(best, rivals, needed)
     runner_up = rival or (rivals[0] if rivals else None)
@@ -280,6 +281,8 @@ def _why_nothing(
     """Return why nothing is reported, as a code and as a sentence with the remedy."""
     if len(query.scene.intersections) == 0:
         return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
+    if listed and listed[0].fault is CameraFault.MIRRORED:
+        return Reason.MIRRORED, "the roads fit better with the image mirrored: was it scanned from its back? Flip it"
     if nearest.said:
         return Reason.TIME_LIMIT if nearest.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, nearest.said
     within = searched_within(options)

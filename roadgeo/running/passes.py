@@ -173,7 +173,7 @@ def _best_of(sightings: Sequence[Sighting]) -> Sighting:
         sightings,
         key=lambda sighting: (
             rank[sighting.location.status],
-            sighting.location.reason_code is Reason.FITS_ELSEWHERE,
+            sighting.location.reason_code in (Reason.FITS_ELSEWHERE, Reason.MIRRORED),
             sighting.location.log10_odds or -math.inf,
         ),
     )

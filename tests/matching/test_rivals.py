@@ -7,7 +7,7 @@ import pytest
 from worlds.lattices import beside, contest
 from worlds.scenes import Sight, camera, estimator_of, look, scene_of
 
-from roadgeo.geometry.camera import CameraOptions, pose, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
@@ -15,7 +15,7 @@ from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.place import Place, Weight
-from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
+from roadgeo.matching.rivals import Rivals, log10_gap, mirrored_likelihood, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about, shifted
 from roadgeo.matching.triples import larger
@@ -373,6 +373,48 @@ def test_beside_a_place_is_never_farther_than_around_it(broken):
     assert beside_it.reach_m == around.reach_m == rivals._AROUND.reach_m
 
 
+# --- the mirrored query -----------------------------------------------------------------------------------------------
+
+
+def mirror_image(evidence):
+    """Return a query mirrored, left to right, as it would be traced, without its intersections."""
+    scene, width = evidence.scene, evidence.scene.size[0]
+    over, back = np.array([-1.0, 1.0]), np.array([width, 0.0])
+    seen = {name: getattr(scene, name) * over + back for name in ("points", "dense_points")}
+    along = {name: getattr(scene, name) * over for name in ("directions", "dense_directions")}
+    return replace(scene, **seen, **along, field=scene.field[:, ::-1], observed=scene.observed[:, ::-1])
+
+
+def test_the_mirror_image_of_a_query_explains_less(broken):
+    truth, index, evidence = broken
+    place = Place(evidence.scene, index, truth)
+    assert mirrored_likelihood(place, MatchOptions()) < 0.8 * place.log10_likelihood
+
+
+@pytest.mark.parametrize("heading", [None, 15.0])
+def test_where_a_mirrored_query_seems_to_lie_its_mirror_image_explains_more(broken, heading):
+    """Wherever the streets run that it was mirrored along, and whatever heading was told."""
+    truth, index, evidence = broken
+    scene, middle = mirror_image(evidence), Homography(truth)(evidence.scene.center)
+    turned = (move_about(middle, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ truth for turn in (-30.0, 30.0))
+    wrong = max((Place(scene, index, matrix) for matrix in turned), key=lambda place: place.log10_likelihood)
+    match = MatchOptions(camera=CameraOptions(heading_deg=heading and (heading, 5.0)))
+    told = mirrored_likelihood(wrong, match)
+    assert told > wrong.log10_likelihood
+    assert told == pytest.approx(evidence.weigh(truth), rel=0.05)
+
+
+@pytest.mark.parametrize(("score", "more", "is_mirrored"), [(4.0, 3.6, True), (4.0, 3.4, False), (13.0, 9.0, False)])
+def test_a_place_where_the_mirrored_query_fits_better_is_none(plain, monkeypatch, score, more, is_mirrored):
+    item, estimator = search_of(plain, plain[0])
+    place = estimator.verified[0]
+    monkeypatch.setattr(rivals, "mirrored_likelihood", lambda *_: place.agreement.log10_likelihood + more)
+    monkeypatch.setattr(Rivals, "_by_roads", lambda *_: place.but(score=score, rival=None))
+    found = Rivals({item: estimator}, Ledger(1), NEEDED).compare(item)
+    assert found.score == pytest.approx(-more if is_mirrored else score)
+    assert found.fault == (CameraFault.MIRRORED if is_mirrored else None)
+
+
 # --- traced roads and the picture -------------------------------------------------------------------------------------
 
 
@@ -402,6 +444,7 @@ def test_traced_roads_and_a_soft_picture_count_together(
     monkeypatch.setattr(Rivals, "_by_roads", lambda *_: here.but(score=by_roads, rival=rival))
     monkeypatch.setattr(Rivals, "_by_picture", lambda *_: there.but(score=by_picture))
     monkeypatch.setattr(estimator, "look_for_equals", lambda *_: True)
+    monkeypatch.setattr(rivals, "mirrored_likelihood", lambda *_: -np.inf)
     assert Rivals({item: estimator}, Ledger(1), NEEDED).compare(item).score == pytest.approx(lead)
 
 

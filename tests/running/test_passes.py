@@ -73,6 +73,12 @@ def test_where_the_roads_fit_far_better_elsewhere_no_other_pass_is_taken(lead, n
     assert len(limits) == n_passes
 
 
+def test_that_the_image_is_mirrored_is_told_though_another_pass_has_a_better_score():
+    mirrored = replace(found(odds=-5.0), status="not_located", reason="flip it", reason_code=Reason.MIRRORED)
+    refused = replace(found(odds=1.0), status="not_located")
+    assert take(mirrored, refused)[0].reason.startswith("flip it")
+
+
 def test_what_is_too_unlikely_for_a_second_pass_is_refused():
     location, _ = take(MaskError("no road"), found(odds=OPTIONS.min_log10_odds + 0.2))
     assert location.status == "not_located"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from worlds.scenes import PLANE, camera, look, random_network, scene_of
 
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.location import Reason, Seconds
 from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.index import build_index
@@ -259,6 +259,15 @@ def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
 )
 def test_a_refusal_states_the_score_that_is_missing(query, searched, score, reported):
     assert reported in judge(query, searched("a", (score, 0.0))).reason
+
+
+def test_where_the_mirrored_image_fits_better_nothing_is_reported_and_the_remedy_is(query, searched):
+    found = searched("a", (-4.0, 0.0), (-5.0, 800.0))
+    best, *others = found.places
+    answer = judge(query, replace(found, places=(best.but(fault=CameraFault.MIRRORED), *others)))
+    assert (answer.status, answer.reason_code) == ("not_located", Reason.MIRRORED)
+    assert answer.reason == "the roads fit better with the image mirrored: was it scanned from its back? Flip it"
+    assert [place.score for place in answer.alternatives] == [-4.0, -5.0]
 
 
 @pytest.mark.parametrize(("along_m", "status"), [(5.0, "located"), (100.0, "ambiguous")])
