@@ -266,7 +266,7 @@ class _Course:
 
     def _rank(self, place: Place) -> tuple[bool, float]:
         """Sort by score; refused places come last, unless the camera's limits alone kept them from being the answer."""
-        return place.fault is not None and place.score < self.needed, -place.score
+        return place.fault in _NEGOTIABLE and place.score < self.needed, -place.score
 
     def _distinct(self, places: Sequence[Place]) -> list[Place]:
         """Return the best entry of each place."""
@@ -303,6 +303,8 @@ class _Course:
 
     def _why(self, place: Place, nearby: float) -> str:
         """Return why a place is not the answer."""
+        if _fits_mirrored(place):
+            return "its roads fit better mirrored"
         if place.fault is not None:
             return f"the camera: {_objection(place)}"
         if not math.isfinite(place.score):
@@ -334,6 +336,8 @@ class _Course:
         if best is not None and best.place.fault is not None and best.place.score >= self.needed:
             objection = _objection(best.place)
             lines.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
+        elif best is not None and _fits_mirrored(best.place):
+            lines.append("the right side: at the best place the roads fit better with the image mirrored")
         elif best is not None and starved == "odds":
             lines.append(f"evidence: at the best place {_weakest(best.place, best.nearby)}")
         if starved == "odds" and self.searched.places and self.searched.places[0].rival is not None:
@@ -348,6 +352,11 @@ class _Course:
         if self.estimator.near is not None and not self.places:
             lines.append("perhaps the circle given is wrong: nothing outside it was tried")
         return lines or ["agreement: nothing on this map is like the mask; another map may be needed"]
+
+
+def _fits_mirrored(place: Place) -> bool:
+    """Return whether the mirrored query fits better where a place was found (see `rivals.mirrored_likelihood`)."""
+    return place.fault is CameraFault.MIRRORED and math.isfinite(place.score)
 
 
 def _number(value: float) -> str:

@@ -15,6 +15,8 @@ from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
+from roadgeo.location import Reason
+from roadgeo.matching import rivals
 from roadgeo.matching.explanation import SCHEMA, Explanation, tell
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
@@ -139,6 +141,17 @@ def test_limits_that_are_too_narrow_are_named(town, mask, limits, fault, value):
     assert search["places"][0]["why"].startswith(f"the camera: {fault} {value}")
     assert search["places"][0]["log10_odds"] > 6
     assert any("limits on the camera may be too narrow" in sentence for sentence in search["missing"])
+
+
+def test_that_the_image_is_mirrored_is_told_of_the_place_where_it_seems_to_lie(town, mask, monkeypatch):
+    monkeypatch.setattr(rivals, "mirrored_likelihood", lambda *_: 1e4)
+    monkeypatch.setattr(rivals, "_CERTAIN", np.inf)
+    explanation = explain(mask, town)
+    assert explanation.location.reason_code is Reason.MIRRORED
+    first, *_ = explanation.stories[0].places
+    assert first.place.agreement.forward > 0.8
+    assert first.why == "its roads fit better mirrored"
+    assert explanation.stories[0].missing[0].startswith("the right side: ")
 
 
 def test_a_place_off_the_map_is_told(town, mask):
