@@ -18,7 +18,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.hints import HINTS, STATED, apply_hints, as_keywords, asked_of_camera, read_hint
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.opening import AnyReference, digest_of, swapped_near
+from roadgeo.reference.opening import AnyReference, digest_of, say_swapped
 from roadgeo.reference.reference import BuildOptions, Reference
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.roads.kinds import ROAD_KINDS, RoadKind
@@ -275,10 +275,8 @@ def locate(
         raise ValueError(f"take={take!r}: places are counted from 1")
     given = mask if isinstance(mask, RoadMask) else read_picture(mask)
     references = _open(reference)
-    meant = None if options.near is None else swapped_near(options.near, references)
-    if meant is not None:
-        near = hints.get("near")
-        raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
+    if said := say_swapped(options.near, references):
+        raise ValueError(said)
     if isinstance(given, RoadMask):
         sighting = Sighting(locate_mask(given, references, options), given)
     else:

@@ -112,7 +112,7 @@ def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:
     ):
         refused = roadgeo.locate(DRONE, porto, QUICK, **wrong)
         assert (refused.status, refused.reason_code) == ("not_located", code)
-    with pytest.raises(ValueError, match=r"did you mean near=\(-8.6, 41.15, 3000.0\)"):
+    with pytest.raises(ValueError, match=r"did you mean near=-8.6,41.15,3000"):
         roadgeo.locate(DRONE, porto, QUICK, near=(41.15, -8.6, 3000.0))
     for within in ("Portugol", (41.1, -8.6, 41.2, -8.7)):
         with pytest.raises(ValueError, match=r"Portugol|south must lie below north"):

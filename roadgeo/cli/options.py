@@ -533,15 +533,11 @@ def open_maps(names: Sequence[str], near: tuple[float, float, float] | None = No
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
-    from roadgeo.reference.opening import open_references, swapped_near
+    from roadgeo.reference.opening import open_references, say_swapped
 
     references = open_references(names, print_steps())
-    meant = None if near is None else swapped_near(near, references)
-    if near is not None and meant is not None:
-        raise click.UsageError(
-            f"--near={near[0]:.9g},{near[1]:.9g},{near[2]:g} lies on none of the maps; longitude comes first:"
-            f" did you mean --near={meant[0]:.9g},{meant[1]:.9g},{meant[2]:g}?"
-        )
+    if said := say_swapped(near, references):
+        raise click.UsageError(said.replace("near=", "--near="))
     compile_once()
     return references
 

@@ -11,7 +11,7 @@ from roadgeo.reference.library import resolve_reference, resolve_references
 from roadgeo.reference.reference import Reference, open_whole
 from roadgeo.reference.shards import ShardedReference, manifest_path, open_shards
 
-__all__ = ["AnyReference", "digest_of", "open_reference", "open_references", "swapped_near"]
+__all__ = ["AnyReference", "digest_of", "open_reference", "open_references", "say_swapped", "swapped_near"]
 
 #: The middle of a frame that shows the edge of a map lies no farther off it than this.
 _BEYOND_M = 3000.0
@@ -37,6 +37,14 @@ def swapped_near(
     if abs(lon) > 90.0 or _touches((lon, lat, radius + _BEYOND_M), references):
         return None
     return (lat, lon, radius) if _touches((lat, lon, radius), references) else None
+
+
+def say_swapped(near: tuple[float, float, float] | None, references: Sequence[AnyReference]) -> str:
+    """Say which circle was meant by one that lies on none of the maps but the other way round; "" of others."""
+    if near is None or (meant := swapped_near(near, references)) is None:
+        return ""
+    given, other = (",".join(f"{number:.9g}" for number in circle) for circle in (near, meant))
+    return f"near={given} lies on none of the maps; longitude comes first: did you mean near={other}?"
 
 
 def _touches(near: tuple[float, float, float], references: Sequence[AnyReference]) -> bool:

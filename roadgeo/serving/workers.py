@@ -208,7 +208,7 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     import numpy as np
 
     from roadgeo.matching.hints import apply_hints, asked_of_camera
-    from roadgeo.reference.opening import digest_of, swapped_near
+    from roadgeo.reference.opening import digest_of, say_swapped
     from roadgeo.running.choosing import place_by_points, take_place
     from roadgeo.running.locating import changed_options
     from roadgeo.running.options import ReadOptions
@@ -233,11 +233,8 @@ def _locate(request: ImageRequest, references: Sequence[Any], say: Say, threads:
     hints.update(read_stated(asked_of_camera(hints), request.path))
     taken, points = hints.pop("take", None), hints.pop("points", None)
     options = apply_hints(LocateOptions(), hints)
-    near = options.near
-    if near is not None and (meant := swapped_near(near, references)) is not None:
-        given, other = (",".join(f"{number:.9g}" for number in place) for place in (near, meant))
-        detail = f"near={given} lies on none of the maps; longitude comes first: did you mean near={other}?"
-        return Reply(400, {"detail": detail})
+    if said := say_swapped(options.near, references):
+        return Reply(400, {"detail": said})
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     kept = Path(request.path).parent.with_name(OWN) / SEEN
