@@ -75,7 +75,7 @@ ERROR_RATES: dict[Kind, tuple[ErrorRate, ...]] = {
         ErrorRate(8.0, 189, 1, 0.0291),
         ErrorRate(15.0, 2359, 0, 0.00156),
     ),
-    "soft mask": (ErrorRate(3.5, 15, 3, 0.481), ErrorRate(8.0, 86, 0, 0.042), ErrorRate(15.0, 229, 0, 0.016)),
+    "soft mask": (ErrorRate(3.5, 21, 0, 0.161), ErrorRate(8.0, 90, 0, 0.0402), ErrorRate(15.0, 313, 0, 0.0117)),
     "hints": (ErrorRate(3.5, 17, 0, 0.195), ErrorRate(15.0, 123, 0, 0.0295)),
     "photograph": (ErrorRate(3.5, 32, 0, 0.109),),
 }
