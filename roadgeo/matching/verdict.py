@@ -326,9 +326,11 @@ def _what_may_help(listed: Sequence[Place], options: LocateOptions) -> str:
         help_ = f"{name} to {precision} {option} would leave {left}" if len(listed) > 1 else f"{name} {option}"
         helps += [help_] * lacks
     others = ["a search with full effort"] * (options.effort == "quick") + ["more roads in view"]
+    # A search for the mirrored image would take as long again, so that is left to those who know what was scanned.
+    others += ["another map, or the image flipped if it was scanned from its back may help"]
     if len(listed) > 1 and helps:
-        return f"{', '.join(helps)}; {', '.join(others)} or another map may help"
-    return f"{', '.join(helps + others)} or another map may help"
+        return f"{', '.join(helps)}; {', '.join(others)}"
+    return ", ".join(helps + others)
 
 
 def how_clear(score: float, needed: float) -> str:

@@ -243,8 +243,8 @@ def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
     assert (best.status, best.center) == ("not_located", None)
     assert "the heading to 5 degrees (--heading DEG+-5) would leave 2 of 2 places" in best.reason
     assert (
-        "the place to 200 m (--near LON,LAT,200) would leave 1 of 2 places; more roads in view or another map"
-        in best.reason
+        "the place to 200 m (--near LON,LAT,200) would leave 1 of 2 places; more roads in view, another map, or "
+        "the image flipped if it was scanned from its back may help" in best.reason
     )
     assert [alternative.score for alternative in best.alternatives] == [1.5, 0.5]
 
