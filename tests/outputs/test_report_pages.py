@@ -134,6 +134,16 @@ def test_a_located_mask_is_shown_and_explained(porto: Reference, drone: RoadMask
     assert len(re.findall(r'<td><button type="button">\d+</button>', page)) == found.n_matched
 
 
+def test_an_image_that_was_mirrored_is_said_to_be(porto: Reference, drone: RoadMask, found: Location) -> None:
+    assert found.place is not None
+    over = np.array([[-1.0, 0.0, drone.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    place = replace(found.place, matrix=found.place.matrix @ over)
+    mirrored = replace(found, places=(place, *found.places[1:]))
+    said = "clockwise from north, mirrored"
+    assert said in Reader(render_report(mirrored, drone, porto.index)).text
+    assert said not in Reader(render_report(found, drone, porto.index)).text
+
+
 def test_the_page_asks_nobody_for_anything(porto: Reference, drone: RoadMask, found: Location) -> None:
     read = Reader(render_report(found, drone, porto.index))
     for tag, attrs in read.tags:

@@ -322,7 +322,8 @@ def _numbers(subject: Subject) -> list[tuple[str, str]]:
         rows.append(("Sampling", f"{place.gsd_m:.3g} m per pixel at the middle"))
     rows.append(("Frame", frame))
     if location.rotation_deg is not None:
-        rows.append(("Image's up", f"{round(location.rotation_deg) % 360}° clockwise from north"))
+        mirrored = ", mirrored" * location.mirrored
+        rows.append(("Image's up", f"{round(location.rotation_deg) % 360}° clockwise from north{mirrored}"))
     if location.tilt_deg is not None:
         source = f" <small>({in_html(location.tilt_source)})</small>" if location.tilt_source else ""
         rows.append(("Tilt", f"{location.tilt_deg:.1f}° from the vertical{source}"))
