@@ -16,6 +16,8 @@ from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.placement import Placement
+from roadgeo.geometry.projection import metres_apart
 from roadgeo.matching.explanation import Explanation, Story, Told
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.place import Place
@@ -38,7 +40,7 @@ from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
-__all__ = ["draw_explanation", "write_explanation", "write_explanation_picture"]
+__all__ = ["draw_explanation", "numbered", "write_explanation", "write_explanation_picture"]
 
 BAR: Color = (150, 178, 204)
 STARVED: Color = rgb("bad")
@@ -101,7 +103,7 @@ def draw_explanation(subject: Subject) -> AnyArray:
     head = below(line(title, 30, bold=True), line(reason, 21, FAINT), width=_WIDTH - 2 * _MARGIN)
     credit = line(str(index.meta.get("attribution", "")), 14, FAINT)
     left = below(*_draw_seen(subject, explanation), *_draw_funnel(story), gap=6, width=_MASK)
-    places = _draw_places(story.places, explanation.scene, index)
+    places = _draw_places(numbered(story, location.places), explanation.scene, index)
     right = below(*places, *_draw_notes(story), credit, gap=8, width=_PLACES)
     return framed(below(head, beside(left, right, gap=_MARGIN), gap=10), _MARGIN)
 
@@ -142,7 +144,21 @@ def _draw_funnel(story: Story) -> list[AnyArray]:
 # --- the places -------------------------------------------------------------------------------------------------------
 
 
-def _draw_places(places: Sequence[Told], scene: Scene, index: ReferenceIndex) -> list[AnyArray]:
+def numbered(story: Story, listed: Sequence[Placement]) -> list[tuple[int | None, Told]]:
+    """Give each place of a story its number in the answer, by which `--take` knows it, or None; these come last."""
+    left, found = list(story.places), []
+    for number, one in enumerate(listed, 1):
+        if one.reference != story.reference or not left:
+            continue
+        middle = np.array(one.center[2:])
+        away, k = min((metres_apart(told.place.lonlat, middle), k) for k, told in enumerate(left))
+        # A wrong number is worse than none, which is what a mask gets whose wide margins were cut off.
+        if away < np.ptp(left[k].place.corners, axis=0).max() / 50:
+            found.append((number, left.pop(k)))
+    return [*found, *((None, told) for told in left)]
+
+
+def _draw_places(places: Sequence[tuple[int | None, Told]], scene: Scene, index: ReferenceIndex) -> list[AnyArray]:
     """Draw the best places, two or three in a row."""
     if not places:
         return [line("No place got as far as being compared with the map.", 22, FAINT)]
@@ -150,7 +166,7 @@ def _draw_places(places: Sequence[Told], scene: Scene, index: ReferenceIndex) ->
     side = (_PLACES - (columns - 1) * _MARGIN) // columns
     drawn = [
         below(_draw_place(entry.place, scene, index, side), *_caption(number, entry, side), width=side)
-        for number, entry in enumerate(places, 1)
+        for number, entry in places
     ]
     rows = [beside(*drawn[k : k + columns], gap=_MARGIN) for k in range(0, len(drawn), columns)]
     return [below(*rows, blank(0, 0), gap=20)]
@@ -181,12 +197,13 @@ def _strokes(scene: Scene, place: Place, chosen: AnyArray) -> FloatArray:
     return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
-def _caption(number: int, entry: Told, side: int) -> list[AnyArray]:
+def _caption(number: int | None, entry: Told, side: int) -> list[AnyArray]:
     place, (lon, lat) = entry.place, entry.place.lonlat.tolist()
     score = f"score {round(place.score, 1) + 0.0:.1f}" if math.isfinite(place.score) else "no fit"
     where = f"{format_lonlat(lon, lat)}   ·   {place.gsd_m:.2f} m/px"
     why = [line(text, 15) for text in textwrap.wrap(entry.why, side // 8)[:3]]
-    return [line(f"{number}   {score}", 19, bold=True), line(where, 15, FAINT), *why]
+    head = score if number is None else f"{number}   {score}"
+    return [line(head, 19, bold=True), line(where, 15, FAINT), *why]
 
 
 # --- notes ------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from shapely import LineString
+from worlds.answers import moved
 from worlds.scenes import PLANE, camera, look, mapped, random_network
 
 from roadgeo.cli import main
@@ -23,7 +24,7 @@ from roadgeo.matching.methods import search_references
 from roadgeo.matching.scene import read_query
 from roadgeo.matching.search import SearchOptions
 from roadgeo.outputs.drawing.layers import rgb
-from roadgeo.outputs.explanation_sheet import STARVED, draw_explanation, write_explanation_picture
+from roadgeo.outputs.explanation_sheet import STARVED, draw_explanation, numbered, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
 from roadgeo.reference.opening import open_reference
@@ -226,6 +227,16 @@ def test_each_reference_has_its_story(town, mask, lattice):
 
 
 class TestPicture:
+    def test_places_bear_the_numbers_of_the_answer(self, town):
+        """Other maps and other passes may have better ones, and put them in another order."""
+        explanation = explain(mask_of(random_network(78)), town)
+        (story,), first = explanation.stories, explanation.location.places[0]
+        elsewhere = [replace(first, reference="another map"), moved(first, 3000.0, 0.0)]
+        (number, told), *others = numbered(story, [*elsewhere, first])
+        assert number == 3
+        assert told.place.lonlat == pytest.approx(first.center[2:], abs=1e-6)
+        assert [number for number, _ in others] == [None] * (len(story.places) - 1)
+
     def test_what_agrees_and_what_does_not(self, town, mask):
         picture = draw_explanation(subject(explain(mask, town), mask, town))
         assert picture.dtype == np.uint8
