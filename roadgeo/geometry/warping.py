@@ -25,6 +25,7 @@ BLOCK = 8192
 #: Step in pixels between exact positions of an image: the largest whose interpolation is as good as exact.
 _NODE_STEPS, _NODE_ERROR_PX = (64, 16, 4), 0.005
 _PER_SIDE = 32  # points on each side of an image's outline
+_ROUNDING = 1e-6  # of a pixel
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,16 @@ class MapGrid:
         )
 
 
-def choose_grid(outline: FloatArray, resolution: float, max_pixels: int) -> MapGrid:
-    """Lay the smallest grid over points (K, 2), its lines at multiples of its resolution.
+def choose_grid(outline: FloatArray, resolution: float, max_pixels: int, on_multiples: bool = True) -> MapGrid:
+    """Lay the smallest grid over points (K, 2), its lines at multiples of its resolution, or from their top left.
 
     Where it would hold more than `max_pixels`, the resolution is made coarser.
     """
     low, high = outline.min(axis=0), outline.max(axis=0)
     resolution = max(resolution, float(np.sqrt(np.prod(high - low) / max_pixels)))
+    if not on_multiples:
+        width, height = np.maximum(np.ceil((high - low) / resolution - _ROUNDING), 1).astype(int).tolist()
+        return MapGrid(float(low[0]), float(high[1]), resolution, width, height)
     first, last = np.floor(low / resolution), np.ceil(high / resolution)
     width, height = np.maximum(last - first, 1).astype(int).tolist()
     return MapGrid(float(first[0] * resolution), float(last[1] * resolution), resolution, width, height)
@@ -76,6 +80,7 @@ def cover(
 ) -> MapGrid:
     """Lay a grid over an image of `size` (width, height), by default with the image's own resolution at its centre.
 
+    An image that lies north up then keeps its pixels; a resolution that is given puts all grids on the same lines.
     The grid may have NaN bounds where the image lies outside what the target CRS is made for.
     """
     frame = Frame(*size)
@@ -86,7 +91,8 @@ def cover(
     if not np.isfinite(outline).all():
         return MapGrid(np.nan, np.nan, np.nan, 0, 0)
     across, along = np.hypot(*(cross[1] - cross[0])), np.hypot(*(cross[3] - cross[2]))
-    return choose_grid(outline, resolution or float(np.sqrt(across * along)), max_pixels)
+    own = float(np.sqrt(across * along))
+    return choose_grid(outline, resolution or own, max_pixels, on_multiples=resolution is not None)
 
 
 def warp(

@@ -13,7 +13,7 @@ from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.warping import cover, source_pixels
+from roadgeo.geometry.warping import cover, source_pixels, warp
 from roadgeo.outputs import orthophoto
 from roadgeo.outputs.options import ImageOptions
 from roadgeo.outputs.orthophoto import (
@@ -288,3 +288,14 @@ def test_where_pixels_come_from_is_as_good_as_exact(k1: float, crs: str | None) 
     assert inside.any()
     off = found[rows][:, columns] - exact
     assert np.abs(off[inside]).max() < 0.01
+
+
+def test_a_picture_that_lies_north_up_keeps_its_pixels() -> None:
+    """Lines half a pixel beside the picture's own would shift what is not interpolated, and blur the rest."""
+    to_crs = np.array([[0.7, 0.0, 5000.35], [0.0, -0.7, 9000.21], [0.0, 0.0, 1.0]])
+    picture = np.random.default_rng(3).integers(0, 256, (40, 50), np.uint8)
+    grid = cover((50, 40), to_crs, None, 4_000_000)
+    assert (grid.width, grid.height) == (50, 40)
+    assert np.array_equal(warp(picture, to_crs, grid), picture)
+    grid = cover((50, 40), to_crs, 0.5, 4_000_000)  # rasters of one resolution lie on the same lines
+    assert (grid.west, grid.north) == (5000.0, 9000.5)
